@@ -1,0 +1,166 @@
+"""The curriculum over terrain levels: promotion and demotion of each environment (Sec. IV-C).
+
+Each environment keeps the outcomes of its last W episodes. When there are W of them, with c
+successes among them and a threshold S, the paper's two rules apply::
+
+    c >= S          ->  level = min(level + 1, L_max - 1)
+    c <  W - S + 1  ->  level = max(level - 1, 0)
+
+Levels run from 0 to L_max - 1, so ``max_level`` is how many there are: 11 for levels 0 to 10.
+
+The paper describes the window twice and not alike. Its text says a *sliding* window that is
+reset "after a level change"; its Algorithm 1 clears the window every time it was full. Here it
+is as the text has it: the rules are tried after every episode once the window is full, and a
+window that left the level where it was goes on sliding. The two differ only for an environment
+that has held its level: the text's reacts within an episode, Algorithm 1's within W. At the top
+(or bottom) level a further promotion (or demotion) is no change, so that window slides too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Ints = NDArray[np.int64]
+
+
+def check_rules(window: int, threshold: int, max_level: int) -> None:
+    """Raise ``ValueError`` unless (window + 1) / 2 < threshold <= window and max_level >= 1.
+
+    With a lower threshold the same count could promote and demote, or would always do one of the
+    two; with a higher one nothing would ever promote.
+    """
+    if not (window + 1) / 2 < threshold <= window:
+        raise ValueError(
+            f"threshold must be above (window + 1) / 2 and at most window, "
+            f"not {threshold} with a window of {window}"
+        )
+    if max_level < 1:
+        raise ValueError(f"max_level is the number of levels, at least 1, not {max_level}")
+
+
+def update_level(
+    level: ArrayLike, successes: ArrayLike, window: int, threshold: int, max_level: int
+) -> Ints:
+    """The level after a full window (Sec. IV-C, the two rules).
+
+    Args:
+        level: level now, any shape, in 0..max_level - 1.
+        successes: successful episodes among the last ``window``, same shape.
+        window: W, episodes.
+        threshold: S, episodes.
+        max_level: L_max, the number of levels.
+
+    Returns:
+        The new level, same shape.
+
+    Raises:
+        ValueError: rules that overlap, see ``check_rules``.
+    """
+    check_rules(window, threshold, max_level)
+    now, count = np.asarray(level, dtype=np.int64), np.asarray(successes)
+    up = np.minimum(now + 1, max_level - 1)
+    down = np.maximum(now - 1, 0)
+    return np.where(count >= threshold, up, np.where(count < window - threshold + 1, down, now))
+
+
+class Curriculum:
+    """Levels and windows of ``n`` environments, each on its own.
+
+    Attributes:
+        levels: (n,), the level of each environment; read it, and let ``push`` change it.
+        outcomes: (n, window) of bool, oldest episode first; empty places come first and are
+            False.
+        counts: (n,), how many of those places are filled.
+    """
+
+    def __init__(
+        self, n: int, window: int, threshold: int, max_level: int, start: ArrayLike = 0
+    ) -> None:
+        """Start all environments at level ``start``, one number or (n,), with empty windows.
+
+        Raises:
+            ValueError: rules that overlap, see ``check_rules``, or a start outside the levels.
+        """
+        check_rules(window, threshold, max_level)
+        self.window, self.threshold, self.max_level = window, threshold, max_level
+        self.levels: Ints = np.broadcast_to(np.asarray(start, dtype=np.int64), n).copy()
+        if n and not (0 <= self.levels.min() and self.levels.max() < max_level):
+            raise ValueError(f"start must be in 0..{max_level - 1}, not {start!r}")
+        self.outcomes: NDArray[np.bool_] = np.zeros((n, window), dtype=bool)
+        self.counts: Ints = np.zeros(n, dtype=np.int64)
+
+    def push(self, envs: ArrayLike, successes: ArrayLike) -> Ints:
+        """Record one finished episode for each of some environments and move their levels.
+
+        The order is that of Algorithm 1: push the outcome; if the window is full, count and
+        update the level; if the level changed, clear the window.
+
+        Args:
+            envs: which environments: k different indices, or a mask (n,) with k of them True.
+            successes: (k,) of bool, in the order of ``envs``.
+
+        Returns:
+            The change of level, (k,): -1, 0 or 1.
+
+        Raises:
+            ValueError: an index twice or out of range, or shapes that do not fit.
+        """
+        who = np.asarray(envs)
+        if who.dtype == bool:
+            if who.shape != self.levels.shape:
+                raise ValueError(f"the mask has shape {who.shape}, not {self.levels.shape}")
+            who = np.flatnonzero(who)
+        who = who.astype(np.int64)  # an empty list comes as floats
+        success = np.asarray(successes, dtype=bool)
+        if who.ndim != 1 or success.shape != who.shape:
+            raise ValueError(f"{who.shape} environments but {success.shape} successes")
+        if len(who) and not (0 <= who.min() and who.max() < len(self.levels)):
+            raise ValueError(f"environments must be in 0..{len(self.levels) - 1}, not {who}")
+        if len(np.unique(who)) != len(who):
+            raise ValueError(f"an environment ends one episode at a time, not {who}")
+
+        self.outcomes[who] = np.column_stack((self.outcomes[who, 1:], success))
+        self.counts[who] = np.minimum(self.counts[who] + 1, self.window)
+
+        before = self.levels[who]
+        after = update_level(
+            before, self.outcomes[who].sum(axis=1), self.window, self.threshold, self.max_level
+        )
+        change = np.where(self.counts[who] == self.window, after - before, 0)
+        self.levels[who] += change
+        moved = who[change != 0]
+        self.outcomes[moved] = False
+        self.counts[moved] = 0
+        return change
+
+    def state_dict(self) -> dict[str, NDArray[np.generic]]:
+        """Everything that ``push`` changes, as copies, for an exact resume."""
+        return {
+            "levels": self.levels.copy(),
+            "outcomes": self.outcomes.copy(),
+            "counts": self.counts.copy(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
+        """Go on from a ``state_dict`` of a curriculum with the same sizes and rules.
+
+        Raises:
+            ValueError: other keys or shapes, or a level or count that is out of range; nothing
+                is changed then.
+        """
+        mine = self.state_dict()
+        if set(state) != set(mine):
+            raise ValueError(f"keys {sorted(state)}, not {sorted(mine)}")
+        loaded = {name: np.array(state[name], dtype=mine[name].dtype) for name in mine}
+        for name, array in loaded.items():
+            if array.shape != mine[name].shape:
+                raise ValueError(f"'{name}' has shape {array.shape}, not {mine[name].shape}")
+        for name, limit in (("levels", self.max_level - 1), ("counts", self.window)):
+            if np.any((loaded[name] < 0) | (loaded[name] > limit)):
+                raise ValueError(f"'{name}' must be in 0..{limit}")
+        self.levels = loaded["levels"]
+        self.outcomes = loaded["outcomes"]
+        self.counts = loaded["counts"]

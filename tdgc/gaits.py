@@ -1,0 +1,130 @@
+"""Gaits and their phase clock (paper Sec. IV-A; clock and schedule of Walk These Ways).
+
+A gait is a triple (phase, offset, bound) of cycle fractions. With the clock g in [0, 1), the feet
+run at
+
+    FL  g + phase + offset + bound
+    FR  g + offset
+    RL  g + bound
+    RR  g + phase
+
+so ``phase`` pairs the diagonals (trot), ``offset`` the front against the rear (bound) and
+``bound`` the left against the right (pace). The first half of a foot's warped phase is stance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FEET = ("FL", "FR", "RL", "RR")
+GAITS = ("trot", "pronk", "pace", "bound")  # the gait index of the paper is the position here
+
+#: (phase, offset, bound) of each gait: the embedding e(g) of the command vector.
+GAIT_TABLE: NDArray[np.float64] = np.array(
+    [
+        [0.5, 0.0, 0.0],  # trot: FL with RR, FR with RL
+        [0.0, 0.0, 0.0],  # pronk: all four together
+        [0.0, 0.0, 0.5],  # pace: left pair against right pair
+        [0.0, 0.5, 0.0],  # bound: front pair against rear pair
+    ]
+)
+
+#: Which of (phase, offset, bound) each foot adds to the clock; rows in the order of FEET.
+_FOOT_OFFSETS: NDArray[np.float64] = np.array(
+    [[1.0, 1.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+)
+
+KAPPA = 0.07  # width of the smoothed contact schedule, in cycles (Walk These Ways)
+
+
+def normal_cdf(x: NDArray[np.floating], scale: float) -> NDArray[np.float64]:
+    """Cumulative normal distribution of ``x / scale`` by Zelen and Severo's 26.2.17.
+
+    Abramowitz and Stegun, error below 7.5e-8; numpy has no erf and one function is no reason
+    for another dependency.
+    """
+    z = np.abs(np.asarray(x, dtype=np.float64)) / scale
+    t = 1.0 / (1.0 + 0.2316419 * z)
+    poly = t * (
+        0.319381530
+        + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429)))
+    )
+    tail = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) * poly
+    return np.where(np.asarray(x) >= 0.0, 1.0 - tail, tail)
+
+
+def gait_embedding(gait: ArrayLike) -> NDArray[np.float64]:
+    """e(g): gait indices (...) -> (phase, offset, bound) (..., 3).
+
+    Raises:
+        ValueError: an index outside 0..3.
+    """
+    index = np.asarray(gait, dtype=np.int64)
+    if index.size and (index.min() < 0 or index.max() >= len(GAITS)):
+        raise ValueError(f"gait index must be 0..{len(GAITS) - 1} ({', '.join(GAITS)})")
+    return GAIT_TABLE[index]
+
+
+def foot_phases(
+    clock: NDArray[np.floating], embedding: NDArray[np.floating], duration: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Warped phase of each foot: (M,), (M, 3), (M,) -> (M, 4) in [0, 1).
+
+    A foot is in stance while its raw phase is below ``duration`` (the duty factor); the warp
+    stretches that to [0, 0.5) and the swing to [0.5, 1).
+    """
+    raw = np.mod(clock[:, None] + embedding @ _FOOT_OFFSETS.T, 1.0)
+    duty = duration[:, None]
+    stance = raw * (0.5 / duty)
+    swing = 0.5 + (raw - duty) * (0.5 / (1.0 - duty))
+    return np.where(raw < duty, stance, swing)
+
+
+def desired_contact(phases: NDArray[np.floating], kappa: float = KAPPA) -> NDArray[np.float64]:
+    """Smoothed contact schedule C of each foot: phases (..., 4) -> (..., 4) in [0, 1]."""
+    return normal_cdf(phases, kappa) * (1.0 - normal_cdf(phases - 0.5, kappa)) + normal_cdf(
+        phases - 1.0, kappa
+    ) * (1.0 - normal_cdf(phases - 1.5, kappa))
+
+
+def swing_profile(phases: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Triangle of the swing: 0 in stance, 1 at mid-swing; phases (..., 4) -> (..., 4)."""
+    swing = np.clip(2.0 * phases - 1.0, 0.0, 1.0)
+    return 1.0 - np.abs(1.0 - 2.0 * swing)
+
+
+class PhaseClock:
+    """One clock a robot, g <- (g + dt f) mod 1, and the four foot phases drawn from it.
+
+    Attributes:
+        clock: (M,) cycle fraction.
+        phases: (M, 4) warped foot phases of the last ``advance``/``update``.
+    """
+
+    def __init__(self, num_robots: int) -> None:
+        self.clock = np.zeros(num_robots)
+        self.phases = np.zeros((num_robots, 4))
+
+    def reset(self, index: ArrayLike, clock: ArrayLike = 0.0) -> None:
+        """Set the clock of the robots in ``index``; call ``update`` to refresh the phases."""
+        self.clock[index] = clock
+
+    def advance(
+        self,
+        dt: float,
+        frequency: NDArray[np.floating],
+        embedding: NDArray[np.floating],
+        duration: NDArray[np.floating],
+    ) -> None:
+        """Move every clock on by ``dt`` seconds at ``frequency`` (M,) Hz."""
+        self.clock = np.mod(self.clock + dt * frequency, 1.0)
+        self.update(embedding, duration)
+
+    def update(self, embedding: NDArray[np.floating], duration: NDArray[np.floating]) -> None:
+        """Recompute the foot phases after a change of gait or duty factor."""
+        self.phases = foot_phases(self.clock, embedding, duration)
+
+    def signal(self) -> NDArray[np.float64]:
+        """phi_t: sin(2 pi phase) of each foot, (M, 4), as the low level sees it."""
+        return np.sin(2.0 * np.pi * self.phases)

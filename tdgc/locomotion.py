@@ -1,0 +1,210 @@
+"""The executor that both levels share: robots in a world, driven by commands and actions.
+
+``Locomotion`` turns low-level actions into joint targets, keeps the phase clock and the histories,
+applies domain randomisation and builds the low level's observation s^L of Sec. IV-A. It knows
+nothing of rewards or tasks; ``tdgc.low_env`` trains on it and ``tdgc.high_env`` drives it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.commands import INDEX, NUM_COMMANDS, OBSERVATION_SCALE, default_command, gait_index
+from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
+from tdgc.gaits import GAITS, PhaseClock
+from tdgc.robot import (
+    FOOT_RADIUS,
+    NUM_JOINTS,
+    Array,
+    foot_kinematics,
+    joint_targets,
+    nominal_pose,
+    yaw_quaternion,
+)
+from tdgc.terrain import TileField
+from tdgc.world import World
+
+SPEED_SCALE = 0.05  # joint speed as the networks see it (Walk These Ways)
+_HISTORY = 3  # control steps of targets kept: the step, and two before for latency up to 40 ms
+
+#: Names and sizes of the actor's observation in order: s^L of Sec. IV-A.
+ACTOR_LAYOUT = (
+    ("gravity", 3),
+    ("joint_error", NUM_JOINTS),
+    ("joint_speed", NUM_JOINTS),
+    ("last_action", NUM_JOINTS),
+    ("action_before", NUM_JOINTS),
+    ("command", NUM_COMMANDS),
+    ("clock", 4),
+    ("gait", 1),
+)
+GYRO_LAYOUT = (("gyro", 3),)
+
+_LEG_SWAP = (1, 0, 3, 2)
+_JOINT_SWAP = tuple(3 * leg + j for leg in _LEG_SWAP for j in range(3))
+_JOINT_SIGN = (-1.0, 1.0, 1.0) * 4
+_COMMAND_SIGN = tuple(
+    -1.0 if i in (INDEX["vy"], INDEX["yaw_rate"], INDEX["roll"]) else 1.0
+    for i in range(NUM_COMMANDS)
+)
+_IDENTITY = {n: tuple(range(n)) for n in (1, 3, NUM_COMMANDS)}
+
+#: How each part of an observation looks in a left-right mirror: (source index, sign).
+MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
+    "gravity": (_IDENTITY[3], (1.0, -1.0, 1.0)),
+    "joint_error": (_JOINT_SWAP, _JOINT_SIGN),
+    "joint_speed": (_JOINT_SWAP, _JOINT_SIGN),
+    "last_action": (_JOINT_SWAP, _JOINT_SIGN),
+    "action_before": (_JOINT_SWAP, _JOINT_SIGN),
+    "command": (_IDENTITY[NUM_COMMANDS], _COMMAND_SIGN),
+    "clock": (_LEG_SWAP, (1.0,) * 4),
+    "gait": (_IDENTITY[1], (1.0,)),
+    "gyro": (_IDENTITY[3], (-1.0, 1.0, -1.0)),
+}
+
+
+def mirror_map(
+    layout: tuple[tuple[str, int], ...],
+    mirrors: dict[str, tuple[tuple[int, ...], tuple[float, ...]]],
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Index and sign with which ``sign * x[..., index]`` is ``x`` seen in a mirror."""
+    index: list[int] = []
+    sign: list[float] = []
+    for name, size in layout:
+        source, signs = mirrors[name]
+        assert len(source) == len(signs) == size, name
+        index += [len(sign) + s for s in source]
+        sign += signs
+    return np.array(index), np.array(sign, dtype=np.float32)
+
+
+def action_mirror() -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The same for the 12 actions."""
+    return np.array(_JOINT_SWAP), np.array(_JOINT_SIGN, dtype=np.float32)
+
+
+class Locomotion:
+    """M robots that take 12 actions each 20 ms and follow 15 commands.
+
+    Attributes:
+        command: (M, 15), to be set by the caller.
+        actions: (2, M, 12), the last clipped action and the one before.
+        targets: (3, M, 12) rad, joint targets of the last step and the two before.
+        delay: (M,) s of latency; joint_offset: (M, 12) rad; friction, payload: (M,).
+    """
+
+    def __init__(
+        self,
+        num_robots: int,
+        robot: RobotConfig,
+        physics: PhysicsConfig,
+        field: TileField | None,
+        gyro: bool = False,
+    ) -> None:
+        self.num_robots = num_robots
+        self.robot = robot
+        self.physics = physics
+        self.gyro = gyro
+        self.world = World(num_robots, robot, physics, field)
+        self.clock = PhaseClock(num_robots)
+        self.nominal = nominal_pose(robot)
+        self.command = np.tile(default_command(), (num_robots, 1))
+        self.actions = np.zeros((2, num_robots, NUM_JOINTS))
+        self.targets = np.tile(self.nominal, (_HISTORY, num_robots, 1))
+        self.delay = np.zeros(num_robots)
+        self.joint_offset = np.zeros((num_robots, NUM_JOINTS))
+        self.friction = np.full(num_robots, physics.friction)
+        self.payload = np.zeros(num_robots)
+        feet, _ = foot_kinematics(self.nominal[None], np.zeros((1, NUM_JOINTS)))
+        self._stand = FOOT_RADIUS - feet[0, :, 2].min()  # trunk above the soles, nominal pose
+
+    @property
+    def layout(self) -> tuple[tuple[str, int], ...]:
+        """Names and sizes of the parts of ``observe``'s rows."""
+        return ACTOR_LAYOUT + (GYRO_LAYOUT if self.gyro else ())
+
+    def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:
+        """Stand the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)
+        rad, with their clocks at ``clock`` (n,), and forget their histories."""
+        feet, _ = foot_kinematics(self.nominal[None], np.zeros((1, NUM_JOINTS)))
+        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        foot_x = xy[:, :1] + c * feet[..., 0] - s * feet[..., 1]
+        foot_y = xy[:, 1:] + s * feet[..., 0] + c * feet[..., 1]
+        ground = self.world.ground_height(foot_x, foot_y).max(axis=1)
+        position = np.column_stack([xy, ground + self._stand])
+        pose = np.tile(self.nominal, (len(index), 1))
+        self.world.reset_robots(index, position, yaw_quaternion(yaw), pose)
+        self.actions[:, index] = 0.0
+        self.targets[:, index] = self.nominal
+        self.clock.reset(index, clock)
+
+    def randomise(
+        self, index: NDArray[np.integer], config: RandomisationConfig, rng: np.random.Generator
+    ) -> None:
+        """Draw the physical parameters of the robots ``index`` about their nominal values."""
+        n = len(index)
+
+        def draw(bounds: Range, nominal: float, shape: tuple[int, ...] = (n,)) -> Array:
+            return nominal + config.scale * (rng.uniform(*bounds, size=shape) - nominal)
+
+        self.friction[index] = draw(config.friction, self.physics.friction)
+        self.payload[index] = draw(config.payload, 0.0)
+        self.world.strength[index, 0] = draw(config.motor_strength, 1.0)
+        self.joint_offset[index] = draw(config.joint_offset, 0.0, (n, NUM_JOINTS))
+        self.delay[index] = draw(config.latency, 0.0)
+        self.world.set_dynamics(index, self.friction[index], self.payload[index])
+
+    def act(self, actions: Array) -> None:
+        """One control step: clip, scale, delay, PD control in Bullet, clock (Sec. IV-A).
+
+        Args:
+            actions: (M, 12), finite.
+        """
+        clipped = np.clip(actions, -self.robot.action_limit, self.robot.action_limit)
+        self.actions = np.stack([clipped, self.actions[0]])
+        self.targets = np.concatenate([joint_targets(self.robot, clipped)[None], self.targets[:-1]])
+        self.world.step(self.targets, self.delay, self.joint_offset)
+        self.clock.advance(
+            self.physics.control_dt,
+            self.command[:, INDEX["frequency"]],
+            self.command[:, 12:],
+            self.command[:, INDEX["duration"]],
+        )
+
+    def observe(
+        self,
+        noise: RandomisationConfig | None = None,
+        rng: np.random.Generator | None = None,
+    ) -> NDArray[np.float32]:
+        """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g], (M, 71), and 3 more with a gyro.
+
+        With ``noise`` and ``rng`` the measured parts carry uniform noise.
+        """
+        state = self.world.state
+        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
+        gravity = state.gravity
+        error = state.q - self.joint_offset - self.nominal
+        speed = state.qd
+        if noise is not None and rng is not None:
+
+            def jitter(like: Array, width: float) -> Array:
+                return noise.scale * width * rng.uniform(-1.0, 1.0, like.shape)
+
+            gravity = gravity + jitter(gravity, noise.noise_gravity)
+            error = error + jitter(error, noise.noise_joint_angle)
+            speed = speed + jitter(speed, noise.noise_joint_speed)
+        parts = [
+            gravity,
+            error,
+            SPEED_SCALE * speed,
+            self.actions[0],
+            self.actions[1],
+            OBSERVATION_SCALE * self.command,
+            self.clock.signal(),
+            gait_index(self.command)[:, None] / (len(GAITS) - 1),
+        ]
+        if self.gyro:
+            # 0.25: angular velocity as Walk These Ways scales it.
+            parts.append(0.25 * np.einsum("mji,mj->mi", state.rotation, state.ang_vel))
+        return np.concatenate(parts, axis=1).astype(np.float32)

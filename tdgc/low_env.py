@@ -1,0 +1,518 @@
+"""The execution-level MDP (paper Sec. IV-A): follow commands, in gait, on rising terrain.
+
+``LowLevelTask`` is the MDP for M robots at once; ``LowLevelEnv`` is its Gymnasium face for one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc import rewards
+from tdgc.commands import CONTINUOUS, INDEX, gait_index
+from tdgc.config import LowLevelConfig
+from tdgc.gaits import GAITS, desired_contact, gait_embedding, swing_profile
+from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
+from tdgc.robot import HIPS_XY, NUM_JOINTS, Array, wrap_angle
+from tdgc.terrain import MAX_LEVEL, TILE_SIZE, TileField, draw_start_goal, make_tile, tile_rng
+from tdgc.world import World
+
+FALL_HEIGHT = 0.15  # m, trunk above the support surface (paper Sec. IV-C)
+TRUNK_FORCE = 40.0  # N (paper Sec. IV-C)
+GOAL_RADIUS = 0.5  # m (paper Sec. IV-C)
+
+# Terrain that the critic sees: 5 x 3 points in the heading frame, from the tail to a step ahead.
+_PROBES = np.array([(x, y) for x in (-0.3, -0.1, 0.1, 0.3, 0.5) for y in (0.15, 0.0, -0.15)])
+_PROBE_SWAP = tuple(3 * (i // 3) + 2 - i % 3 for i in range(len(_PROBES)))
+#: The critic's own part of the observation; the actor never sees it.
+CRITIC_LAYOUT = (
+    ("velocity", 3),
+    ("angular_velocity", 3),
+    ("base_height", 1),
+    ("foot_height", 4),
+    ("foot_contact", 4),
+    ("desired_contact", 4),
+    ("dynamics", 4),
+    ("terrain", len(_PROBES)),
+)
+_CRITIC_MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
+    "velocity": ((0, 1, 2), (1.0, -1.0, 1.0)),
+    "angular_velocity": ((0, 1, 2), (-1.0, 1.0, -1.0)),
+    "base_height": ((0,), (1.0,)),
+    "foot_height": ((1, 0, 3, 2), (1.0,) * 4),
+    "foot_contact": ((1, 0, 3, 2), (1.0,) * 4),
+    "desired_contact": ((1, 0, 3, 2), (1.0,) * 4),
+    "dynamics": ((0, 1, 2, 3), (1.0,) * 4),
+    "terrain": (_PROBE_SWAP, (1.0,) * len(_PROBES)),
+}
+
+# Terrain episodes: most robots cross the tile from platform to platform, as the decision level
+# will ask of them, facing where they go or any other way; the rest take free commands.
+_CROSSING_SHARE = 0.8
+_FACING_SHARE = 0.6
+_CROSSING_SPEED = (0.3, 1.0)  # m/s
+_HEADING_GAIN = 1.0  # 1/s, yaw rate asked per rad of heading error
+
+# Training tiles are 4 m wide, since Bullet keeps 600 bytes for each sample of a height field.
+_CROP = 2.0  # m at either side
+_PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
+
+# Command curriculum: a gait's velocity range grows when it tracks well over an evaluation batch.
+_GROWTH = 0.05
+_GROW_LIN, _GROW_YAW = 0.7, 0.6  # of the terms' maxima (Walk These Ways: 0.8 and 0.7)
+
+
+def is_fallen(world: World) -> NDArray[np.bool_]:
+    """The paper's failures that concern the body: (M,) trunk low or hit."""
+    state = world.state
+    support = world.support_height(state.position[:, 0], state.position[:, 1])
+    low = state.position[:, 2] - support < FALL_HEIGHT
+    return np.asarray(low | (state.trunk_force > TRUNK_FORCE))
+
+
+class LowLevelTask:
+    """The low-level MDP of M robots.
+
+    Observation rows are [actor part | critic part]; ``actor_dim`` says where the actor's ends.
+    Actions are (M, 12) in [-a_max, a_max]. An episode ends in failure when the trunk is lower than
+    0.15 m above the support surface or hits something with more than 40 N, and is truncated after
+    20 s or where the robot leaves its tile.
+
+    Args:
+        config: the MDP's configuration.
+        num_robots: M.
+        seed: of everything random here.
+        training: draw noise, pushes and randomised dynamics.
+    """
+
+    def __init__(
+        self, config: LowLevelConfig, num_robots: int, seed: int, training: bool = True
+    ) -> None:
+        self.config = config
+        self.num_robots = num_robots
+        self.training = training
+        self.rng = np.random.default_rng(seed)
+        self.horizon = round(config.episode_seconds / config.physics.control_dt)
+        self._command_steps = round(config.command_seconds / config.physics.control_dt)
+        bounds = np.array([getattr(config.commands, name) for name in CONTINUOUS])
+        self._low, self._high = bounds.T
+        #: Share of the velocity ranges in use, a gait.
+        self.command_share = np.full(len(GAITS), config.command_start if training else 1.0)
+        m = num_robots
+        self.column = np.arange(m) % len(config.families)
+        self.level = self.rng.integers(0, min(3, config.levels), m)
+        self._seed = seed
+        self._epoch = 0
+        self.field = self._build_field()
+        if self.field is not None:
+            self._draw_tiles()
+        self.locomotion = self._build_locomotion()
+        self.elapsed = np.zeros(m, dtype=np.int64)
+        self._next_push = np.zeros(m, dtype=np.int64)
+        self._crossing = np.zeros(m, dtype=bool)
+        self._speed = np.zeros(m)
+        self._facing = np.zeros(m)
+        self._waypoint = np.zeros((m, 2))
+        self._reached = np.zeros(m, dtype=bool)
+        self._was_contact = np.zeros((m, 4), dtype=bool)
+        self._origin = np.zeros((m, 2))
+        self._gait_scores = np.zeros((len(GAITS), 3))
+        self.stats: dict[str, float] = {}
+        self._ground = self._measure_ground()
+        layout = self.locomotion.layout
+        self.actor_dim = sum(size for _, size in layout)
+        self.obs_dim = self.actor_dim + sum(size for _, size in CRITIC_LAYOUT)
+        self.observation_mirror = mirror_map(layout + CRITIC_LAYOUT, MIRRORS | _CRITIC_MIRRORS)
+        self.action_mirror = action_mirror()
+        limit = config.robot.action_limit
+        self.action_space = gym.spaces.Box(-limit, limit, (NUM_JOINTS,), np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
+
+    def _build_field(self) -> TileField | None:
+        """A tile of its own for every robot, of its level and family."""
+        if self.config.terrain == "plane":
+            return None
+        return TileField((self.num_robots, 1), crop=_CROP)
+
+    def _draw_tiles(self) -> None:
+        """Fresh tiles at the robots' present levels."""
+        assert self.field is not None
+        for i in range(self.num_robots):
+            family, level = self.config.families[self.column[i]], int(self.level[i])
+            rng = tile_rng(self._seed, family, level, self._epoch * self.num_robots + i)
+            self.field.place(i, 0, make_tile(family, level / MAX_LEVEL, rng))
+
+    def _build_locomotion(self) -> Locomotion:
+        c = self.config
+        return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro)
+
+    # ------------------------------------------------------------------ episodes
+
+    def reset(self, index: NDArray[np.integer]) -> None:
+        """Start new episodes for the robots ``index`` (n,)."""
+        n, rng = len(index), self.rng
+        self._finish_statistics(index)
+        if self.field is None:
+            xy = np.stack([index % 10, index // 10], axis=1) * _PLANE_SPACING
+            yaw = rng.uniform(-np.pi, np.pi, n)
+            self._crossing[index] = False
+        else:
+            self._origin[index] = self.field.origin(index, np.zeros_like(index))
+            xy, yaw, goal = np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2))
+            for k, i in enumerate(index):
+                start, goal[k] = draw_start_goal(rng)
+                xy[k] = start[:2]
+                yaw[k] = start[2]
+            xy += self._origin[index]
+            self._waypoint[index] = goal + self._origin[index]
+            self._crossing[index] = rng.uniform(size=n) < _CROSSING_SHARE
+        self._reached[index] = False
+        self.elapsed[index] = 0
+        self._was_contact[index] = False
+        if self.training:
+            self.locomotion.randomise(index, self.config.randomisation, rng)
+            self._schedule_push(index)
+        self._draw_commands(index)
+        if self.field is not None:
+            # Face so that the first command needs no turn on the spot.
+            yaw = yaw + np.where(self._crossing[index], self._facing[index], 0.0)
+        self.locomotion.place(index, xy, yaw, rng.uniform(size=n))
+        self._refresh()
+
+    def restart(self) -> None:
+        """End every episode, redraw the terrain and build the world anew.
+
+        Bullet's own history is gone afterwards: what follows depends on ``state_dict`` alone.
+        """
+        self.locomotion.world.close()
+        self._epoch += 1
+        if self.field is not None:
+            self._draw_tiles()
+        self.locomotion = self._build_locomotion()
+        self._gait_scores[:] = 0.0
+        self.stats = {}
+        self.reset(np.arange(self.num_robots))
+        # Spread the ends of the coming episodes over time.
+        self.elapsed[:] = self.rng.integers(0, self.horizon, self.num_robots)
+        self._schedule_push(np.arange(self.num_robots))
+
+    def step(
+        self, actions: NDArray[np.floating]
+    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+        """One control step of all robots: (M, 12) -> reward, terminated, truncated, (M,) each."""
+        loco, c = self.locomotion, self.config
+        before = loco.world.state.qd
+        loco.act(np.asarray(actions, dtype=np.float64))
+        self.elapsed += 1
+        self._ground = self._measure_ground()
+        terms = rewards.low_terms(self._low_step(before), c.rewards)
+        reward = rewards.total(terms, c.rewards, c.physics.control_dt)
+        terminated = is_fallen(loco.world)
+        truncated = (self.elapsed >= self.horizon) | self._left_tile()
+        truncated &= ~terminated
+        self._count(terms, reward, terminated)
+        self._was_contact = loco.world.state.foot_force > rewards.CONTACT_FORCE
+        self._update_curriculum(terminated | truncated, terminated)
+        self._refresh()
+        return reward, terminated, truncated
+
+    def observe(self) -> NDArray[np.float32]:
+        """(M, obs_dim): the actor's part, noisy in training, and the critic's."""
+        noise = self.config.randomisation if self.training else None
+        actor = self.locomotion.observe(noise, self.rng)
+        return np.concatenate([actor, self._critic()], axis=1).astype(np.float32)
+
+    def _critic(self) -> Array:
+        loco, state = self.locomotion, self.locomotion.world.state
+        base_height, foot_height, probes = self._ground
+        body_rate = np.einsum("mji,mj->mi", state.rotation, state.ang_vel)
+        dynamics = [
+            loco.friction,
+            loco.payload / 3.0,
+            5.0 * (loco.world.strength[:, 0] - 1.0),
+            loco.delay / 0.03,
+        ]
+        return np.concatenate(
+            [
+                2.0 * state.heading_vel,
+                0.25 * body_rate,
+                10.0 * (base_height - self.config.robot.base_height)[:, None],
+                10.0 * foot_height,
+                state.foot_force > rewards.CONTACT_FORCE,
+                desired_contact(loco.clock.phases),
+                np.stack(dynamics, axis=1),
+                5.0 * np.clip(probes, -0.5, 0.5),
+            ],
+            axis=1,
+        )
+
+    def _measure_ground(self) -> tuple[Array, Array, Array]:
+        """Trunk above the ground (M,), feet above the ground (M, 4), probes below the standing
+        trunk (M, 15), in m."""
+        world = self.locomotion.world
+        state = world.state
+        c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
+        points = np.concatenate([_PROBES, HIPS_XY])
+        x = state.position[:, :1] + c * points[:, 0] - s * points[:, 1]
+        y = state.position[:, 1:2] + s * points[:, 0] + c * points[:, 1]
+        n = len(_PROBES)
+        surface = world.ground_height(
+            np.concatenate([x[:, :n], state.foot_position[..., 0]], axis=1),
+            np.concatenate([y[:, :n], state.foot_position[..., 1]], axis=1),
+        )
+        support = world.support_height(x[:, n:], y[:, n:]).mean(axis=1)
+        base = state.position[:, 2] - support
+        feet = state.foot_position[..., 2] - surface[:, n:]
+        standing = state.position[:, 2:3] - self.config.robot.base_height
+        return base, feet, surface[:, :n] - standing
+
+    def _low_step(self, speed_before: Array) -> rewards.LowStep:
+        loco, c = self.locomotion, self.config
+        base_height, foot_height, _ = self._ground
+        return rewards.LowStep(
+            state=loco.world.state,
+            command=loco.command,
+            phases=loco.clock.phases,
+            contact=desired_contact(loco.clock.phases),
+            swing=swing_profile(loco.clock.phases),
+            base_height=base_height,
+            foot_height=foot_height,
+            standing_height=c.robot.base_height,
+            targets=loco.targets,
+            actions=loco.actions,
+            acceleration=(loco.world.state.qd - speed_before) / c.physics.control_dt,
+            was_contact=self._was_contact,
+            sigma_lin=c.rewards.sigma_lin,
+            sigma_yaw=c.rewards.sigma_yaw,
+        )
+
+    def _left_tile(self) -> NDArray[np.bool_]:
+        if self.field is None:
+            return np.zeros(self.num_robots, dtype=bool)
+        x, y = self.locomotion.world.state.position[:, :2].T
+        return ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
+
+    # ------------------------------------------------------------------ commands and pushes
+
+    def _draw_commands(self, index: NDArray[np.integer]) -> None:
+        n, rng, command = len(index), self.rng, self.locomotion.command
+        gait = rng.integers(0, len(GAITS), n)
+        values = rng.uniform(self._low, self._high, (n, len(CONTINUOUS)))
+        values[:, :3] *= self.command_share[gait][:, None]
+        # A tenth stands: stepping on the spot is asked for at every goal.
+        values[rng.uniform(size=n) < 0.1, :3] = 0.0
+        command[index] = np.concatenate([values, gait_embedding(gait)], axis=1)
+        self._speed[index] = rng.uniform(*_CROSSING_SPEED, n)
+        free = rng.uniform(-np.pi, np.pi, n)
+        self._facing[index] = np.where(rng.uniform(size=n) < _FACING_SHARE, 0.0, free)
+
+    def _refresh(self) -> None:
+        """Everything that changes commands between two steps: resampling, crossing, pushes."""
+        if self.config.command_seconds > 0:
+            due = np.flatnonzero((self.elapsed % self._command_steps == 0) & (self.elapsed > 0))
+            if due.size:
+                self._draw_commands(due)
+        if self.field is not None:
+            self._steer_crossings()
+        if self.training:
+            self._push()
+
+    def _steer_crossings(self) -> None:
+        """Point the velocity commands of crossing robots at their waypoint."""
+        state = self.locomotion.world.state
+        offset = self._waypoint - state.position[:, :2]
+        arrived = self._crossing & (np.linalg.norm(offset, axis=1) < GOAL_RADIUS)
+        if arrived.any():
+            # There and back again: the next waypoint is on the platform at the other end.
+            self._reached |= arrived
+            local = self._waypoint[arrived] - self._origin[arrived]
+            local[:, 0] = TILE_SIZE - local[:, 0]
+            self._waypoint[arrived] = local + self._origin[arrived]
+            offset = self._waypoint - state.position[:, :2]
+        bearing = np.arctan2(offset[:, 1], offset[:, 0])
+        error = wrap_angle(bearing + self._facing - state.yaw)
+        direction = bearing - state.yaw
+        velocity = self._speed[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+        over = np.abs(velocity) / self._high[:2]
+        velocity /= np.maximum(over.max(axis=1, keepdims=True), 1.0)
+        turn = np.clip(_HEADING_GAIN * error, self._low[2], self._high[2])
+        rows = np.flatnonzero(self._crossing)
+        self.locomotion.command[rows, :2] = velocity[rows]
+        self.locomotion.command[rows, 2] = turn[rows]
+
+    def _schedule_push(self, index: NDArray[np.integer]) -> None:
+        seconds = self.rng.uniform(*self.config.randomisation.push_interval, len(index))
+        steps = np.maximum(1, seconds / self.config.physics.control_dt)
+        self._next_push[index] = self.elapsed[index] + steps.astype(int)
+
+    def _push(self) -> None:
+        index = np.flatnonzero(self.elapsed >= self._next_push)
+        if not index.size:
+            return
+        r = self.config.randomisation
+        angle = self.rng.uniform(-np.pi, np.pi, index.size)
+        speed = r.scale * r.push_speed * self.rng.uniform(size=index.size)
+        velocity = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+        self.locomotion.world.push(index, speed[:, None] * velocity)
+        self._schedule_push(index)
+
+    # ------------------------------------------------------------------ curriculum, statistics
+
+    def _update_curriculum(
+        self, done: NDArray[np.bool_], failed: NDArray[np.bool_]
+    ) -> None:
+        """Move robots that end an episode between levels, as legged_gym does.
+
+        Up when the tile was crossed; down when less than half of it was; a robot that crosses the
+        last level starts over at a random one.
+        """
+        if self.field is None or not self.training:
+            return
+        top = self.config.levels - 1
+        crossed = done & self._crossing & self._reached
+        local = self.locomotion.world.state.position[:, 0] - self._origin[:, 0]
+        short = done & self._crossing & ~self._reached & (local < 0.5 * TILE_SIZE)
+        short &= failed | (self.elapsed >= self.horizon)
+        self.level = np.where(crossed, self.level + 1, np.where(short, self.level - 1, self.level))
+        solved = self.level > top
+        self.level[solved] = self.rng.integers(0, top + 1, int(solved.sum()))
+        self.level = np.clip(self.level, 0, top)
+
+    def _count(
+        self, terms: dict[str, Array], reward: Array, terminated: NDArray[np.bool_]
+    ) -> None:
+        """Add this step to ``stats`` (sums; ``tdgc.training`` divides and logs them)."""
+        loco, stats = self.locomotion, self.stats
+
+        def add(key: str, value: float) -> None:
+            stats[key] = stats.get(key, 0.0) + float(value)
+
+        add("steps", self.num_robots)
+        add("falls", terminated.sum())
+        add("reward", reward.sum())
+        for name, value in terms.items():
+            add(f"term/{name}", value.sum())
+        state, gait = loco.world.state, gait_index(loco.command)
+        lin = np.sum((state.heading_vel[:, :2] - loco.command[:, :2]) ** 2, axis=1)
+        yaw = (state.ang_vel[:, 2] - loco.command[:, INDEX["yaw_rate"]]) ** 2
+        wanted = desired_contact(loco.clock.phases) > 0.5
+        match = np.mean((state.foot_force > rewards.CONTACT_FORCE) == wanted, axis=1)
+        for g, name in enumerate(GAITS):
+            mine = gait == g
+            add(f"gait/{name}/steps", mine.sum())
+            add(f"gait/{name}/lin", lin[mine].sum())
+            add(f"gait/{name}/yaw", yaw[mine].sum())
+            add(f"gait/{name}/match", match[mine].sum())
+            self._gait_scores[g] += (
+                mine.sum(),
+                terms["track_lin_vel"][mine].sum(),
+                terms["track_yaw_rate"][mine].sum(),
+            )
+        self._grow_commands()
+        if self.field is not None:
+            for col, family in enumerate(self.config.families):
+                mine = self.column == col
+                add(f"level/{family}/count", mine.sum())
+                add(f"level/{family}/level", self.level[mine].sum())
+
+    def _grow_commands(self) -> None:
+        """Widen the velocity range of a gait that tracked well over its last samples."""
+        samples = 200 * self.num_robots / len(GAITS)  # about 4 s of every robot
+        weights = self.config.rewards
+        for g in np.flatnonzero(self._gait_scores[:, 0] >= samples):
+            count, lin, yaw = self._gait_scores[g]
+            good = lin / count > _GROW_LIN * weights.track_lin_vel
+            good &= yaw / count > _GROW_YAW * weights.track_yaw_rate
+            if good and self.training:
+                self.command_share[g] = min(1.0, self.command_share[g] + _GROWTH)
+            self._gait_scores[g] = 0.0
+
+    def _finish_statistics(self, index: NDArray[np.integer]) -> None:
+        self.stats["episodes"] = self.stats.get("episodes", 0.0) + len(index)
+
+    def take_stats(self) -> dict[str, float]:
+        """The sums since the last call."""
+        stats, self.stats = self.stats, {}
+        for g, name in enumerate(GAITS):
+            stats[f"share/{name}"] = float(self.command_share[g])
+        stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
+        return stats
+
+    # ------------------------------------------------------------------ resume
+
+    def state_dict(self) -> dict[str, Any]:
+        """JSON-ready state from which ``restart`` gives the same future everywhere."""
+        return {
+            "rng": self.rng.bit_generator.state,
+            "epoch": self._epoch,
+            "level": self.level.tolist(),
+            "command_share": self.command_share.tolist(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a ``state_dict``; call ``restart`` afterwards."""
+        self.rng.bit_generator.state = state["rng"]
+        self._epoch = int(state["epoch"])
+        self.level = np.array(state["level"], dtype=np.int64)
+        self.command_share = np.array(state["command_share"], dtype=np.float64)
+
+    def close(self) -> None:
+        """Disconnect from Bullet."""
+        self.locomotion.world.close()
+
+
+class LowLevelEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One robot of ``LowLevelTask`` as a Gymnasium environment, id ``tdgc/LowLevel-v0``."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
+
+    def __init__(self, config: LowLevelConfig | None = None, render_mode: str | None = None):
+        self.config = config or LowLevelConfig()
+        self.render_mode = render_mode
+        self.task = LowLevelTask(self.config, 1, seed=0)
+        self.action_space = self.task.action_space
+        self.observation_space = self.task.observation_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        super().reset(seed=seed)
+        if seed is not None:
+            self.task.close()
+            self.task = LowLevelTask(self.config, 1, seed=seed)
+        self.task.reset(np.arange(1))
+        return self.task.observe()[0], {}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        reward, terminated, truncated = self.task.step(np.asarray(action)[None])
+        return self.task.observe()[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+    def close(self) -> None:
+        self.task.close()
+
+
+def summarise(sums: dict[str, float]) -> dict[str, float]:
+    """Sums of ``LowLevelTask.take_stats`` over all workers -> values to log."""
+    steps = max(sums.get("steps", 0.0), 1.0)
+    values = {"reward/total": sums.get("reward", 0.0) / steps}
+    values["falls_per_minute"] = sums.get("falls", 0.0) / (steps * 0.02 / 60.0)
+    for key, value in sums.items():
+        if key.startswith("term/"):
+            values[f"reward/{key[5:]}"] = value / steps
+        elif key.startswith("share/"):
+            values[f"command_share/{key[6:]}"] = value / sums["workers"]
+    for gait in GAITS:
+        n = max(sums.get(f"gait/{gait}/steps", 0.0), 1.0)
+        values[f"tracking/{gait}_velocity_rmse"] = (sums.get(f"gait/{gait}/lin", 0.0) / n) ** 0.5
+        values[f"tracking/{gait}_yaw_rate_rmse"] = (sums.get(f"gait/{gait}/yaw", 0.0) / n) ** 0.5
+        values[f"tracking/{gait}_contact_match"] = sums.get(f"gait/{gait}/match", 0.0) / n
+    families = [k.split("/")[1] for k in sums if k.startswith("level/") and k.endswith("/count")]
+    for family in families:
+        count = max(sums[f"level/{family}/count"], 1.0)
+        values[f"level/{family}"] = sums[f"level/{family}/level"] / count
+    return values

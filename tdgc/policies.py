@@ -1,0 +1,678 @@
+"""Policies and their files: weights as safetensors, everything else as JSON, no pickle anywhere.
+
+A policy on disk is two files side by side: ``NAME.safetensors`` holds the tensors of actor and
+critic, ``NAME.json`` says what they mean::
+
+    {"format": "tdgc-policy", "version": 1,
+     "kind": "mlp",                                   "mlp" (Sec. IV-A) or "lstm" (Sec. IV-B)
+     "architecture": {"activation": "elu",            elu, relu or tanh, after each hidden layer
+                      "actor": [256, 128],            hidden sizes
+                      "critic": [256, 128],
+                      "lstm": null},                  hidden size of both LSTMs; null for "mlp"
+     "observation": {"size": 95, "actor_size": 70},   [actor part | critic-only part]
+     "action": {"size": 12, "low": [...], "high": [...]},            null: unbounded
+     "sha256": "...",                                 of NAME.safetensors
+     "meta": {...}}                                   the caller's: configuration, seed, steps, ...
+
+Tensors are float32, named ``actor.0.weight``, ``actor.0.bias``, ... (the last one gives the mean
+action), ``critic.*`` likewise (the last one gives the value), ``log_std``, and for "lstm" also
+``actor_lstm.*`` and ``critic_lstm.*`` with ``weight_ih``, ``weight_hh``, ``bias_ih``,
+``bias_hh`` (gate order i, f, g, o as in PyTorch).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch as th
+import torch.nn.functional as F
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import (
+    FlattenExtractor,
+    MlpExtractor,
+    create_mlp,
+)
+from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
+
+FORMAT = "tdgc-policy"
+VERSION = 1
+KINDS = ("mlp", "lstm")
+ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
+
+Array = NDArray[np.float32]
+State = tuple[NDArray[np.float32], ...]
+
+_deserialize: Callable[[bytes], list[tuple[str, dict[str, Any]]]] = safetensors.deserialize
+
+_FUNCTIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
+    "elu": F.elu, "relu": th.relu, "tanh": th.tanh
+}  # fmt: skip
+_LSTM_TENSORS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+_MAX_JSON_BYTES = 4 * 2**20
+_MAX_WEIGHT_BYTES = 256 * 2**20
+_MAX_SIZE = 65536  # of any layer, observation or action
+_MAX_LAYERS = 32
+_MAX_FLOAT32 = float(np.finfo(np.float32).max)
+_MAX_TENSOR_HEADER = 65536  # bytes of a safetensors file that are not weights
+
+
+class PolicyFileError(ValueError):
+    """A policy file that cannot be used; the message is one line and names the file."""
+
+
+# ---------------------------------------------------------------------------------------------
+# The trained side: an SB3 policy whose critic sees more than its actor
+
+
+class AsymmetricMlpExtractor(nn.Module):
+    """Two separate MLPs: the actor's on the first ``actor_dim`` features, the critic's on all."""
+
+    def __init__(
+        self,
+        actor_dim: int,
+        critic_dim: int,
+        net_arch: dict[str, list[int]],
+        activation_fn: type[nn.Module],
+    ) -> None:
+        super().__init__()
+        self.actor_dim = actor_dim
+        actor, critic = net_arch.get("pi", []), net_arch.get("vf", [])
+        self.policy_net = nn.Sequential(*create_mlp(actor_dim, -1, actor, activation_fn))
+        self.value_net = nn.Sequential(*create_mlp(critic_dim, -1, critic, activation_fn))
+        self.latent_dim_pi = actor[-1] if actor else actor_dim
+        self.latent_dim_vf = critic[-1] if critic else critic_dim
+
+    def forward(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """(n, critic_dim) -> (n, latent_dim_pi), (n, latent_dim_vf)."""
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: th.Tensor) -> th.Tensor:
+        """(n, critic_dim) or (n, actor_dim) -> (n, latent_dim_pi)."""
+        return cast(th.Tensor, self.policy_net(features[..., : self.actor_dim]))
+
+    def forward_critic(self, features: th.Tensor) -> th.Tensor:
+        """(n, critic_dim) -> (n, latent_dim_vf)."""
+        return cast(th.Tensor, self.value_net(features))
+
+
+class AsymmetricActorCriticPolicy(ActorCriticPolicy):
+    """SB3 policy for a Box observation laid out as [actor part | critic-only part].
+
+    The critic may be told what the robot cannot sense (friction, true velocity, payload); the
+    actor sees the first ``actor_dim`` entries and nothing else. Everything that SB3's
+    ``ActorCriticPolicy`` takes can be given too; ``net_arch`` and ``activation_fn`` have other
+    defaults here.
+
+    Raises:
+        ValueError: the observation is not a flat Box, or ``actor_dim`` does not fit it.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        *,
+        actor_dim: int,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ELU,
+        **kwargs: Any,
+    ) -> None:
+        shape = observation_space.shape if isinstance(observation_space, spaces.Box) else None
+        if shape is None or len(shape) != 1:
+            raise ValueError(f"the observation space must be a flat Box, not {observation_space}")
+        if not 0 < actor_dim <= shape[0]:
+            raise ValueError(f"actor_dim must be in 1..{shape[0]}, not {actor_dim}")
+        self.actor_dim = actor_dim
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch={"pi": [256, 128], "vf": [256, 128]} if net_arch is None else net_arch,
+            activation_fn=activation_fn,
+            **kwargs,
+        )
+
+    def _build_mlp_extractor(self) -> None:
+        arch = self.net_arch
+        self.mlp_extractor = AsymmetricMlpExtractor(  # type: ignore[assignment]
+            self.actor_dim,
+            self.features_dim,
+            arch if isinstance(arch, dict) else {"pi": arch, "vf": arch},
+            self.activation_fn,
+        ).to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "actor_dim": self.actor_dim}
+
+
+# ---------------------------------------------------------------------------------------------
+# The header: what NAME.json says
+
+
+@dataclass(frozen=True)
+class Header:
+    """The content of ``NAME.json``, checked."""
+
+    kind: str
+    activation: str
+    actor: tuple[int, ...]
+    critic: tuple[int, ...]
+    lstm: int | None
+    obs_dim: int
+    actor_dim: int
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    meta: dict[str, Any]
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Name and shape of every tensor, in the order they are written."""
+        shapes: dict[str, tuple[int, ...]] = {"log_std": (len(self.low),)}
+        for net, inputs, hidden, outputs in (
+            ("actor", self.actor_dim, self.actor, len(self.low)),
+            ("critic", self.obs_dim, self.critic, 1),
+        ):
+            if self.lstm is not None:
+                gates = 4 * self.lstm
+                lstm_shapes = ((gates, inputs), (gates, self.lstm), (gates,), (gates,))
+                for tensor, shape in zip(_LSTM_TENSORS, lstm_shapes, strict=True):
+                    shapes[f"{net}_lstm.{tensor}"] = shape
+                inputs = self.lstm
+            for i, size in enumerate((*hidden, outputs)):
+                shapes[f"{net}.{i}.weight"] = (size, inputs)
+                shapes[f"{net}.{i}.bias"] = (size,)
+                inputs = size
+        return shapes
+
+    def nbytes(self) -> int:
+        """Bytes that the weights take, all tensors together."""
+        return 4 * sum(math.prod(shape) for shape in self.shapes().values())
+
+    def to_json(self, sha256: str) -> str:
+        """The text of ``NAME.json``.
+
+        Raises:
+            ValueError: ``meta`` holds something that JSON cannot say.
+        """
+        table = {
+            "format": FORMAT,
+            "version": VERSION,
+            "kind": self.kind,
+            "architecture": {
+                "activation": self.activation,
+                "actor": list(self.actor),
+                "critic": list(self.critic),
+                "lstm": self.lstm,
+            },
+            "observation": {"size": self.obs_dim, "actor_size": self.actor_dim},
+            "action": {
+                "size": len(self.low),
+                "low": [x if math.isfinite(x) else None for x in self.low],
+                "high": [x if math.isfinite(x) else None for x in self.high],
+            },
+            "sha256": sha256,
+            "meta": self.meta,
+        }
+        try:
+            return json.dumps(table, indent=2, allow_nan=False) + "\n"
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"meta cannot be written as JSON: {error}") from None
+
+    @classmethod
+    def from_json(cls, text: str) -> tuple[Header, str]:
+        """Header and checksum from the text of ``NAME.json``.
+
+        Raises:
+            PolicyFileError: not JSON, another format or version, a key too many or too few, a
+                value of the wrong type or out of range. Its message does not name the file.
+        """
+        try:
+            table = json.loads(text, parse_constant=_no_constant)
+        except (ValueError, RecursionError) as error:
+            raise PolicyFileError(f"not JSON ({_one_line(error)})") from None
+        if not isinstance(table, dict) or table.get("format") != FORMAT:
+            raise PolicyFileError(f"not a {FORMAT} file")
+        version = table.get("version")
+        if not isinstance(version, int) or isinstance(version, bool) or version != VERSION:
+            raise PolicyFileError(f"format version {version!r:.40}; this code reads {VERSION}")
+        keys = ("format", "version", "kind", "architecture", "observation", "action", "sha256",
+                "meta")  # fmt: skip
+        _check_keys(table, keys, "the file")
+        kind, sha256, meta = table["kind"], table["sha256"], table["meta"]
+        if kind not in KINDS:
+            raise PolicyFileError(f"kind {kind!r:.40}; known: {', '.join(KINDS)}")
+        if not isinstance(sha256, str):
+            raise PolicyFileError(f"'sha256' must be a string, not {sha256!r:.40}")
+        if not isinstance(meta, dict):
+            raise PolicyFileError(f"'meta' must be a table, not {meta!r:.40}")
+
+        arch = table["architecture"]
+        _check_keys(arch, ("activation", "actor", "critic", "lstm"), "'architecture'")
+        if not isinstance(arch["activation"], str) or arch["activation"] not in ACTIVATIONS:
+            known = ", ".join(ACTIVATIONS)
+            raise PolicyFileError(f"activation {arch['activation']!r:.40}; known: {known}")
+        if (arch["lstm"] is not None) != (kind == "lstm"):
+            raise PolicyFileError(f"'lstm' is {arch['lstm']!r:.40} in a file of kind '{kind}'")
+
+        observation = table["observation"]
+        _check_keys(observation, ("size", "actor_size"), "'observation'")
+        obs_dim = _size(observation["size"], "'size' of 'observation'")
+        actor_dim = _size(observation["actor_size"], "'actor_size'")
+        if actor_dim > obs_dim:
+            raise PolicyFileError(f"'actor_size' {actor_dim} is more than the {obs_dim} there are")
+
+        action = table["action"]
+        _check_keys(action, ("size", "low", "high"), "'action'")
+        action_dim = _size(action["size"], "'size' of 'action'")
+        low = _bounds(action["low"], action_dim, -math.inf, "'low'")
+        high = _bounds(action["high"], action_dim, math.inf, "'high'")
+        if any(lo > hi for lo, hi in zip(low, high, strict=True)):
+            raise PolicyFileError("'low' of 'action' is above 'high'")
+        header = cls(
+            kind=kind,
+            activation=arch["activation"],
+            actor=_sizes(arch["actor"], "'actor'"),
+            critic=_sizes(arch["critic"], "'critic'"),
+            lstm=None if arch["lstm"] is None else _size(arch["lstm"], "'lstm'"),
+            obs_dim=obs_dim,
+            actor_dim=actor_dim,
+            low=low,
+            high=high,
+            meta=meta,
+        )
+        if header.nbytes() > _MAX_WEIGHT_BYTES:
+            raise PolicyFileError(f"{header.nbytes()} bytes of weights, too large to be a policy")
+        return header, sha256
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _check_keys(table: Any, keys: tuple[str, ...], where: str) -> None:
+    if not isinstance(table, dict):
+        raise PolicyFileError(f"{where} must be a table of keys, not {table!r:.40}")
+    for key in table:
+        if key not in keys:
+            raise PolicyFileError(f"unknown key {key!r:.40} in {where}")
+    for key in keys:
+        if key not in table:
+            raise PolicyFileError(f"key '{key}' is missing from {where}")
+
+
+def _size(value: Any, name: str) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MAX_SIZE:
+        raise PolicyFileError(f"{name} must be a whole number in 1..{_MAX_SIZE}, not {value!r:.40}")
+    return value
+
+
+def _sizes(value: Any, name: str) -> tuple[int, ...]:
+    if not isinstance(value, list) or len(value) > _MAX_LAYERS:
+        raise PolicyFileError(f"{name} must be a list of at most {_MAX_LAYERS} layer sizes")
+    return tuple(_size(v, f"{name}[{i}]") for i, v in enumerate(value))
+
+
+def _bounds(value: Any, count: int, unbounded: float, name: str) -> tuple[float, ...]:
+    if not isinstance(value, list) or len(value) != count:
+        raise PolicyFileError(f"{name} of 'action' must be a list of {count} numbers")
+    bounds = []
+    for number in value:
+        if number is None:
+            bounds.append(unbounded)
+        elif isinstance(number, (int, float)) and not isinstance(number, bool):
+            if not abs(number) <= _MAX_FLOAT32:  # a JSON 1e999 reads as inf
+                raise PolicyFileError(f"{name} of 'action' holds {number!r:.40}, out of range")
+            bounds.append(float(number))
+        else:
+            raise PolicyFileError(f"{name} of 'action' holds {number!r:.40}, not a number")
+    return tuple(bounds)
+
+
+# ---------------------------------------------------------------------------------------------
+# Writing and reading
+
+
+def save(path: str | os.PathLike[str], policy: ActorCriticPolicy, meta: dict[str, Any]) -> None:
+    """Write ``policy`` as ``path.safetensors`` and ``path.json``.
+
+    Each file is replaced atomically, weights first: a reader that comes in between sees a wrong
+    checksum, never a half-written file or the wrong meaning.
+
+    Args:
+        path: with or without one of the two suffixes; missing folders are made.
+        policy: ``AsymmetricActorCriticPolicy``, SB3's ``MlpPolicy`` or sb3-contrib's
+            ``MlpLstmPolicy`` (one layer, an LSTM each for actor and critic) and subclasses, with
+            a flat Box observation and action and a state-independent standard deviation.
+        meta: anything JSON can say: configuration, seed, steps, wall time, code version.
+
+    Raises:
+        ValueError: a policy of another make, weights that are not finite, or ``meta`` that JSON
+            cannot say; nothing is written then.
+        OSError: the files cannot be written.
+    """
+    header = _describe(policy, meta)
+    tensors = {
+        name: tensor.detach().to("cpu", th.float32).contiguous()
+        for name, tensor in _tensors(policy).items()
+    }
+    for name, tensor in tensors.items():
+        if not bool(tensor.isfinite().all()):
+            raise ValueError(f"tensor {name} holds a number that is not finite; not saved")
+    weights = safetensors.torch.save(tensors)
+    text = header.to_json(hashlib.sha256(weights).hexdigest()).encode()
+    if len(text) > _MAX_JSON_BYTES:
+        raise ValueError(f"meta takes {len(text)} bytes, more than {_MAX_JSON_BYTES}")
+    Header.from_json(text.decode())  # what could not be read back is not written
+    stem = _stem(path)
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    _write(_with_suffix(stem, ".safetensors"), weights)
+    _write(_with_suffix(stem, ".json"), text)
+
+
+def load(path: str | os.PathLike[str]) -> Policy:
+    """The policy that ``save`` wrote as ``path`` (with or without one of the two suffixes).
+
+    Raises:
+        PolicyFileError: whatever is wrong with the files, in one line.
+    """
+    header, tensors = _read(path)
+    return Policy(header, tensors)
+
+
+def load_into(path: str | os.PathLike[str], policy: ActorCriticPolicy) -> dict[str, Any]:
+    """Copy the weights in ``path`` into an SB3 ``policy`` built with the same sizes.
+
+    For training on from a saved policy. Returns the file's ``meta``.
+
+    Raises:
+        PolicyFileError: whatever is wrong with the files, or a policy of another architecture.
+    """
+    header, tensors = _read(path)
+    mine = _describe(policy, header.meta)
+    for name in ("kind", "activation", "lstm", "actor", "critic", "obs_dim", "actor_dim"):
+        if getattr(mine, name) != getattr(header, name):
+            raise PolicyFileError(
+                f"{path}: {name} is {getattr(header, name)}, this policy's {getattr(mine, name)}"
+            )
+    if len(mine.low) != len(header.low):
+        raise PolicyFileError(f"{path}: {len(header.low)} actions, this policy {len(mine.low)}")
+    with th.no_grad():
+        for name, tensor in _tensors(policy).items():
+            tensor.copy_(tensors[name])
+    return header.meta
+
+
+def _stem(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    return path.with_suffix("") if path.suffix in (".safetensors", ".json") else path
+
+
+def _with_suffix(stem: Path, suffix: str) -> Path:
+    # Not Path.with_suffix, which would eat the ".5" of "low-v1.5".
+    return stem.parent / (stem.name + suffix)
+
+
+def _write(path: Path, data: bytes) -> None:
+    temporary = path.parent / f".{path.name}.{os.getpid()}.tmp"
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _read_bytes(path: Path, limit: int) -> bytes:
+    try:
+        with open(path, "rb") as file:
+            data = file.read(limit + 1)
+    except FileNotFoundError:
+        raise PolicyFileError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise PolicyFileError(f"{path}: cannot be read ({_one_line(error)})") from None
+    if len(data) > limit:
+        raise PolicyFileError(f"{path}: larger than the {limit} bytes it can have")
+    return data
+
+
+def _read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
+    stem = _stem(path)
+    header_path, weights_path = _with_suffix(stem, ".json"), _with_suffix(stem, ".safetensors")
+    try:
+        text = _read_bytes(header_path, _MAX_JSON_BYTES).decode()
+    except UnicodeDecodeError:
+        raise PolicyFileError(f"{header_path}: not UTF-8 text") from None
+    try:
+        header, sha256 = Header.from_json(text)
+    except PolicyFileError as error:
+        raise PolicyFileError(f"{header_path}: {error}") from None
+
+    # The header's sizes are checked by now, and they bound what is read and allocated here.
+    shapes, need = header.shapes(), header.nbytes()
+    data = _read_bytes(weights_path, need + _MAX_TENSOR_HEADER)
+    if len(data) < need:
+        raise PolicyFileError(
+            f"{weights_path}: {len(data)} bytes, truncated: the architecture needs over {need}"
+        )
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise PolicyFileError(f"{weights_path}: not the file that {header_path.name} was made for")
+    try:
+        entries = dict(_deserialize(data))
+    except safetensors.SafetensorError as error:
+        message = f"{weights_path}: not a safetensors file ({_one_line(error)})"
+        raise PolicyFileError(message) from None
+
+    for name in sorted(entries.keys() ^ shapes.keys()):
+        what = "is missing" if name in shapes else "is not part of the architecture"
+        raise PolicyFileError(f"{weights_path}: tensor {name!r:.60} {what}")
+    tensors = {}
+    for name, shape in shapes.items():
+        entry = entries[name]
+        if entry["dtype"] != "F32" or tuple(entry["shape"]) != shape:
+            raise PolicyFileError(
+                f"{weights_path}: tensor '{name}' is {entry['dtype']} {tuple(entry['shape'])}, "
+                f"the architecture needs F32 {shape}"
+            )
+        array = np.frombuffer(entry["data"], "<f4").astype(np.float32).reshape(shape)
+        if not np.isfinite(array).all():
+            raise PolicyFileError(f"{weights_path}: tensor '{name}' holds a number not finite")
+        tensors[name] = th.from_numpy(array)
+    return header, tensors
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
+    """The header of an SB3 policy; ``ValueError`` where the format has no words for it."""
+    obs_space, action_space = policy.observation_space, policy.action_space
+    for name, space in (("observation", obs_space), ("action", action_space)):
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise ValueError(f"the {name} space must be a flat Box, not {space}")
+    plain = isinstance(policy.action_dist, DiagGaussianDistribution) and not policy.squash_output
+    if type(policy.features_extractor) is not FlattenExtractor or not plain:
+        raise ValueError("only policies on flat features with a plain Gaussian can be saved")
+    if type(policy.mlp_extractor) not in (MlpExtractor, AsymmetricMlpExtractor):
+        raise ValueError("only policies with a plain MLP for actor and critic can be saved")
+    activations = [name for name, fn in ACTIVATIONS.items() if fn is policy.activation_fn]
+    if not activations:
+        raise ValueError(f"activation {policy.activation_fn}; known: {', '.join(ACTIVATIONS)}")
+
+    lstm = None
+    if isinstance(policy, RecurrentActorCriticPolicy):
+        lstm = policy.lstm_actor.hidden_size
+        if policy.lstm_critic is None or policy.lstm_kwargs or policy.lstm_actor.num_layers != 1:
+            raise ValueError("only plain LSTMs of one layer, one each for actor and critic")
+    tensors = _tensors(policy)
+
+    def hidden(net: str) -> tuple[int, ...]:
+        layers = [t for name, t in tensors.items() if name.startswith(net + ".") and t.dim() == 2]
+        return tuple(len(layer) for layer in layers[:-1])
+
+    box = cast(spaces.Box, action_space)
+    obs_dim = cast(tuple[int, ...], obs_space.shape)[0]
+    return Header(
+        kind="mlp" if lstm is None else "lstm",
+        activation=activations[0],
+        actor=hidden("actor"),
+        critic=hidden("critic"),
+        lstm=lstm,
+        obs_dim=obs_dim,
+        actor_dim=getattr(policy, "actor_dim", obs_dim),
+        low=tuple(float(x) for x in box.low),
+        high=tuple(float(x) for x in box.high),
+        meta=meta,
+    )
+
+
+def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
+    """The live parameters of an SB3 policy under the names of the file."""
+    extractor = policy.mlp_extractor
+    tensors: dict[str, th.Tensor] = {"log_std": cast(th.Tensor, policy.log_std)}
+    for net, body, output in (
+        ("actor", extractor.policy_net, policy.action_net),
+        ("critic", extractor.value_net, policy.value_net),
+    ):
+        if isinstance(policy, RecurrentActorCriticPolicy):
+            lstm = getattr(policy, f"lstm_{net}")
+            for tensor in _LSTM_TENSORS:
+                tensors[f"{net}_lstm.{tensor}"] = getattr(lstm, f"{tensor}_l0")
+        layers = [m for m in (*body, output) if isinstance(m, nn.Linear)]
+        for i, layer in enumerate(layers):
+            tensors[f"{net}.{i}.weight"] = layer.weight
+            tensors[f"{net}.{i}.bias"] = layer.bias
+    return tensors
+
+
+# ---------------------------------------------------------------------------------------------
+# The loaded side
+
+
+class Policy:
+    """A loaded policy: acts as SB3's does, without SB3.
+
+    Attributes:
+        kind: "mlp" or "lstm".
+        meta: what the caller of ``save`` gave.
+        obs_dim: width of the full observation, actor and critic-only part.
+        actor_dim: width of the part that the actor sees.
+        action_dim: number of actions.
+        low, high: bounds of the actions, (action_dim,), in the environment's action units.
+        tensors: all weights by the name in the file, the critic's too.
+    """
+
+    def __init__(self, header: Header, tensors: dict[str, th.Tensor]) -> None:
+        self.kind = header.kind
+        self.meta = header.meta
+        self.obs_dim = header.obs_dim
+        self.actor_dim = header.actor_dim
+        self.action_dim = len(header.low)
+        self.low: Array = np.array(header.low, dtype=np.float32)
+        self.high: Array = np.array(header.high, dtype=np.float32)
+        self.tensors = tensors
+        self._hidden = header.lstm
+        self._activation = _FUNCTIONS[header.activation]
+        self._layers = [
+            (tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"])
+            for i in range(len(header.actor) + 1)
+        ]
+        self._lstm = [tensors[f"actor_lstm.{t}"] for t in _LSTM_TENSORS] if header.lstm else []
+        self._std: Array = np.exp(tensors["log_std"].numpy())
+        self.seed(0)
+
+    def seed(self, seed: int | None) -> None:
+        """Restart the noise of ``predict(..., deterministic=False)``."""
+        self._rng = np.random.default_rng(seed)
+
+    def predict(
+        self,
+        obs: ArrayLike,
+        state: State | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Array, State | None]:
+        """Actions for observations, in SB3's convention.
+
+        Args:
+            obs: (n, d) or (d,), where d is ``actor_dim`` or ``obs_dim``; of the latter only the
+                actor part is used.
+            state: (h, c), each (1, n, hidden), as returned before; None for zeros. For "mlp" it
+                is handed back as it came.
+            episode_start: (n,) or a scalar, true where the state is to be zeroed first.
+            deterministic: the mean action, or else one drawn from the Gaussian.
+
+        Returns:
+            Actions clipped to ``low`` and ``high``, (n, action_dim) or (action_dim,), and the new
+            state, (h, c) or what was given.
+
+        Raises:
+            ValueError: an observation or state of the wrong shape.
+        """
+        x = np.asarray(obs)
+        if x.ndim not in (1, 2) or x.shape[-1] not in (self.actor_dim, self.obs_dim):
+            raise ValueError(
+                f"observation of shape {x.shape}; its last axis must be {self.actor_dim} wide "
+                f"(actor part) or {self.obs_dim} (all)"
+            )
+        batch: Array = np.array(np.atleast_2d(x)[:, : self.actor_dim], dtype=np.float32)
+        with _one_thread(), th.inference_mode():
+            latent = th.from_numpy(batch)
+            if self._hidden is not None:
+                h, c = self._previous(state, episode_start, len(batch), self._hidden)
+                h, c = th.lstm_cell(latent, (h, c), *self._lstm)
+                latent, state = h, (h.numpy()[None], c.numpy()[None])
+            for weight, bias in self._layers[:-1]:
+                latent = self._activation(F.linear(latent, weight, bias))
+            actions: Array = F.linear(latent, *self._layers[-1]).numpy()
+        if not deterministic:
+            noise = self._rng.standard_normal(actions.shape, dtype=np.float32)
+            actions = actions + self._std * noise
+        actions = np.clip(actions, self.low, self.high)
+        return (actions if x.ndim == 2 else actions[0]), state
+
+    @staticmethod
+    def _previous(
+        state: State | None, episode_start: ArrayLike | None, n: int, hidden: int
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """(h, c), each (n, hidden), with the rows that start an episode at zero."""
+        if state is None:
+            return th.zeros(n, hidden), th.zeros(n, hidden)
+        shapes = [np.shape(part) for part in state]
+        if shapes != [(1, n, hidden)] * 2:
+            raise ValueError(f"state of shapes {shapes}; it must be two of {(1, n, hidden)}")
+        h, c = (np.array(part[0], dtype=np.float32) for part in state)
+        if episode_start is not None:
+            start = np.broadcast_to(np.asarray(episode_start, dtype=bool), n)
+            h[start] = c[start] = 0.0
+        return th.from_numpy(h), th.from_numpy(c)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    # The networks are too small to share out: one thread costs nothing when cores are idle, is
+    # several times faster when they are not, and gives the same bits whatever the setting.
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(threads)

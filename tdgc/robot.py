@@ -1,0 +1,197 @@
+"""The robot on arrays: joint order, nominal pose, joint PD, leg kinematics and the state.
+
+Plain numpy; ``tdgc.world`` fills a ``RobotState`` from Bullet and asks ``pd_torque`` for torques.
+Every array has a leading axis of M robots. Legs in the order of ``tdgc.gaits.FEET``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.config import ConfigError, RobotConfig
+from tdgc.gaits import FEET
+
+Array = NDArray[np.float64]
+
+JOINTS = tuple(f"{leg}_{part}_joint" for leg in FEET for part in ("hip", "thigh", "calf"))
+NUM_JOINTS = len(JOINTS)
+
+# Geometry of urdf/quadruped.urdf (a test compares it with Bullet's own link poses).
+HIP_X = 0.183  # m, hip joint ahead of the trunk's centre
+HIP_Y = 0.047  # m, and to the side
+ABDUCTION = 0.08  # m, from the hip joint out to the thigh joint
+THIGH = 0.213  # m
+CALF = 0.213  # m
+FOOT_RADIUS = 0.022  # m
+TRUNK_MASS = 5.6  # kg
+#: Joint limits in rad, (12, 2), as in the URDF.
+JOINT_LIMITS: Array = np.tile([[-0.86, 0.86], [-0.69, 4.5], [-2.82, -0.89]], (4, 1))
+
+_SIDE = np.array([1.0, -1.0, 1.0, -1.0])  # left +, right -
+_FRONT = np.array([1.0, 1.0, -1.0, -1.0])
+#: Hip joints in the trunk's frame, (4, 2).
+HIPS_XY: Array = np.stack([HIP_X * _FRONT, HIP_Y * _SIDE], axis=1)
+
+
+def urdf_path(config: RobotConfig) -> Path:
+    """Absolute path of the robot's URDF: as given, or relative to the repository.
+
+    Raises:
+        ConfigError: no such file.
+    """
+    given = Path(config.urdf)
+    for path in (given, Path(__file__).resolve().parent.parent / given):
+        if path.is_file():
+            return path.resolve()
+    raise ConfigError(f"robot.urdf: no file '{config.urdf}' here or in the repository")
+
+
+def nominal_pose(config: RobotConfig) -> Array:
+    """q0 of the paper, (12,) rad."""
+    pose = [
+        (config.nominal_hip * side, config.nominal_thigh[0 if front > 0 else 1], config.nominal_calf)
+        for side, front in zip(_SIDE, _FRONT, strict=True)
+    ]
+    return np.array(pose).ravel()
+
+
+def joint_targets(config: RobotConfig, actions: Array) -> Array:
+    """q* = q0 + alpha clip(a, -a_max, a_max): (M, 12) -> (M, 12) rad (Sec. IV-A)."""
+    scale = config.action_scale * np.tile([config.hip_scale, 1.0, 1.0], 4)
+    clipped = np.clip(actions, -config.action_limit, config.action_limit)
+    return np.asarray(nominal_pose(config) + scale * clipped)
+
+
+def pd_torque(
+    error: Array, speed: Array, strength: Array, config: RobotConfig
+) -> Array:
+    """Joint torques of the PD law, limited as the motors are.
+
+    Args:
+        error: (M, 12) target minus angle, rad.
+        speed: (M, 12) joint speed, rad/s.
+        strength: (M, 1) motor strength, times gains and limits.
+        config: gains and limits.
+
+    Returns:
+        (M, 12) N m. A joint at its speed limit gets no torque that would drive it faster.
+    """
+    limit = np.tile(config.torque_limit, 4) * strength
+    torque = strength * (config.kp * error - config.kd * speed)
+    np.clip(torque, -limit, limit, out=torque)
+    runaway = (np.abs(speed) >= np.tile(config.speed_limit, 4)) & (torque * speed > 0.0)
+    torque[runaway] = 0.0
+    return torque
+
+
+def foot_kinematics(q: Array, qd: Array) -> tuple[Array, Array]:
+    """Foot centres and velocities in the trunk's frame: (M, 12) twice -> (M, 4, 3) twice."""
+    angle, rate = q.reshape(-1, 4, 3), qd.reshape(-1, 4, 3)
+    hip, thigh, knee = angle[..., 0], angle[..., 1], angle[..., 1] + angle[..., 2]
+    hip_d, thigh_d, knee_d = rate[..., 0], rate[..., 1], rate[..., 1] + rate[..., 2]
+    st, ct = THIGH * np.sin(thigh), THIGH * np.cos(thigh)
+    sk, ck = CALF * np.sin(knee), CALF * np.cos(knee)
+    x, down = -st - sk, -ct - ck
+    x_d, down_d = -ct * thigh_d - ck * knee_d, st * thigh_d + sk * knee_d
+    sh, ch = np.sin(hip), np.cos(hip)
+    out = ABDUCTION * _SIDE
+    y, z = out * ch - down * sh, out * sh + down * ch
+    position = np.stack([x + HIPS_XY[:, 0], y + HIPS_XY[:, 1], z], axis=-1)
+    velocity = np.stack([x_d, -z * hip_d - down_d * sh, y * hip_d + down_d * ch], axis=-1)
+    return position, velocity
+
+
+def rotation_matrix(quaternion: Array) -> Array:
+    """Body-to-world rotation of (M, 4) quaternions (x, y, z, w) -> (M, 3, 3)."""
+    x, y, z, w = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def yaw_quaternion(yaw: Array) -> Array:
+    """Quaternions (M, 4) of upright bodies with heading ``yaw`` (M,) rad."""
+    zero = np.zeros_like(yaw)
+    return np.stack([zero, zero, np.sin(0.5 * yaw), np.cos(0.5 * yaw)], axis=-1)
+
+
+def wrap_angle(angle: Array) -> Array:
+    """Angles brought to [-pi, pi)."""
+    return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
+
+
+@dataclass
+class RobotState:
+    """What Bullet says about M robots after a control step, and what follows from it.
+
+    Attributes:
+        position, quaternion: trunk in the world, (M, 3) m and (M, 4).
+        lin_vel, ang_vel: trunk in the world, (M, 3) m/s and rad/s.
+        q, qd, torque: joints, (M, 12) rad, rad/s and N m (torque of the last physics step).
+        foot_force: normal contact force on each foot, (M, 4) N.
+        leg_force: the same on each leg above the foot (hip, knee and calf), (M, 4) N.
+        trunk_force: largest normal force on the trunk in any physics step, (M,) N.
+    """
+
+    position: Array
+    quaternion: Array
+    lin_vel: Array
+    ang_vel: Array
+    q: Array
+    qd: Array
+    torque: Array
+    foot_force: Array
+    leg_force: Array
+    trunk_force: Array
+    rotation: Array = field(init=False)
+    yaw: Array = field(init=False)
+    gravity: Array = field(init=False)
+    heading_vel: Array = field(init=False)
+    foot_body: Array = field(init=False)
+    foot_position: Array = field(init=False)
+    foot_velocity: Array = field(init=False)
+
+    @classmethod
+    def zeros(cls, num_robots: int) -> RobotState:
+        """A state of ``num_robots`` upright robots at the origin."""
+        m = num_robots
+        quaternion = np.zeros((m, 4))
+        quaternion[:, 3] = 1.0
+        arrays = [np.zeros((m, n)) for n in (3, 3, 12, 12, 12, 4, 4)]
+        lin, ang, q, qd, torque, foot, leg = arrays
+        state = cls(
+            np.zeros((m, 3)), quaternion, lin, ang, q, qd, torque, foot, leg, np.zeros(m)
+        )
+        state.derive()
+        return state
+
+    def derive(self) -> None:
+        """Fill the fields that follow from the measured ones.
+
+        ``gravity`` is the unit vector of gravity in the body frame, g^b of the paper, (M, 3);
+        ``heading_vel`` the velocity (forward, left, up) in the frame turned by yaw alone, (M, 3);
+        ``foot_body`` the foot centres in the body frame, ``foot_position`` and ``foot_velocity``
+        in the world, (M, 4, 3).
+        """
+        self.rotation = rotation_matrix(self.quaternion)
+        self.yaw = np.arctan2(self.rotation[:, 1, 0], self.rotation[:, 0, 0])
+        self.gravity = -self.rotation[:, 2, :]
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        vx, vy, vz = self.lin_vel.T
+        self.heading_vel = np.stack([c * vx + s * vy, c * vy - s * vx, vz], axis=-1)
+        self.foot_body, foot_vel = foot_kinematics(self.q, self.qd)
+        turned = self.rotation[:, None]
+        arm = (turned @ self.foot_body[..., None])[..., 0]
+        self.foot_position = self.position[:, None] + arm
+        self.foot_velocity = (
+            self.lin_vel[:, None]
+            + np.cross(self.ang_vel[:, None], arm)
+            + (turned @ foot_vel[..., None])[..., 0]
+        )

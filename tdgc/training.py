@@ -1,0 +1,360 @@
+"""What both trainers share: the run folder, checkpoints, logs, mirrored samples, interruption.
+
+A run folder holds ``config.json``, ``log.jsonl`` (a row every ``log_steps``), TensorBoard's event
+files, ``policy.safetensors`` with ``policy.json`` (the last policy, ready to be used) and
+``checkpoints/`` with the two newest states from which a run goes on exactly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
+from tqdm import tqdm
+
+from tdgc import __version__, policies
+from tdgc.vec import TaskVecEnv
+
+_KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
+
+
+class CheckpointError(ValueError):
+    """A checkpoint or run folder that cannot be used; the message is one line."""
+
+
+class MirroredRolloutBuffer(RolloutBuffer):
+    """A rollout buffer whose minibatches also hold their left-right mirror images.
+
+    A quadruped is symmetric, so a mirrored sample is as good as a second robot's. Its advantage,
+    return and old log-probability are the original's; where the policy is not yet symmetric,
+    PPO's clipping bounds the difference.
+
+    Args:
+        observation_mirror, action_mirror: (index, sign) with which ``sign * x[:, index]`` is x
+            seen in a mirror.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        observation_mirror: tuple[NDArray[np.int64], NDArray[np.float32]],
+        action_mirror: tuple[NDArray[np.int64], NDArray[np.float32]],
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self._mirrors = observation_mirror, action_mirror
+
+    def _get_samples(self, batch_inds: NDArray[np.int64], env: Any = None) -> RolloutBufferSamples:
+        samples = super()._get_samples(batch_inds, env)
+        (obs_index, obs_sign), (act_index, act_sign) = self._mirrors
+        seen = samples.observations[:, obs_index] * th.from_numpy(obs_sign)
+        done = samples.actions[:, act_index] * th.from_numpy(act_sign)
+        both = [th.cat([samples.observations, seen]), th.cat([samples.actions, done])]
+        rest = [th.cat([x, x]) for x in samples[2:]]
+        return RolloutBufferSamples(*both, *rest)
+
+
+# ---------------------------------------------------------------------------- checkpoints
+
+
+def _random_states() -> tuple[dict[str, th.Tensor], dict[str, Any]]:
+    name, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)
+    version, words, carry = random.getstate()
+    states = {"numpy": [position, has_gauss, gauss], "python": [version, carry], "kind": name}
+    tensors = {
+        "random.torch": th.get_rng_state(),
+        "random.numpy": th.from_numpy(np.asarray(keys).astype(np.int64)),
+        "random.python": th.tensor(words, dtype=th.int64),
+    }
+    return tensors, states
+
+
+def _restore_random(tensors: dict[str, th.Tensor], states: dict[str, Any]) -> None:
+    th.set_rng_state(tensors["random.torch"].to(th.uint8))
+    keys = tensors["random.numpy"].numpy().astype(np.uint32)
+    np.random.set_state((states["kind"], keys, *states["numpy"]))
+    version, carry = states["python"]
+    random.setstate((version, tuple(tensors["random.python"].tolist()), carry))
+
+
+def save_checkpoint(folder: Path, model: BaseAlgorithm, extra: dict[str, Any]) -> Path:
+    """Write the learner's whole state; a reader sees it complete or not at all."""
+    tensors = {f"policy.{k}": v for k, v in model.policy.state_dict().items()}
+    optimiser = model.policy.optimizer.state_dict()
+    for index, slots in optimiser["state"].items():
+        tensors |= {f"optimizer.{index}.{k}": th.as_tensor(v) for k, v in slots.items()}
+    random_tensors, random_states = _random_states()
+    tensors |= random_tensors
+    data = safetensors.torch.save({k: v.contiguous() for k, v in tensors.items()})
+    header = {
+        "format": "tdgc-checkpoint",
+        "version": 1,
+        "code": __version__,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "num_timesteps": model.num_timesteps,
+        "n_updates": model._n_updates,  # type: ignore[attr-defined]
+        "random": random_states,
+        **extra,
+    }
+    final = folder / f"step-{model.num_timesteps:012d}"
+    partial = folder / f".{final.name}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    for name, content in (("state.safetensors", data), ("state.json", json.dumps(header).encode())):
+        with open(partial / name, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    shutil.rmtree(final, ignore_errors=True)
+    os.replace(partial, final)
+    for old in sorted(folder.glob("step-*"))[:-_KEEP]:
+        shutil.rmtree(old)
+    return final
+
+
+def read_checkpoint(path: Path) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
+    """Tensors and header of one checkpoint.
+
+    Raises:
+        CheckpointError: missing, damaged or foreign files.
+    """
+    try:
+        data = (path / "state.safetensors").read_bytes()
+        header = json.loads((path / "state.json").read_bytes())
+        if header.get("format") != "tdgc-checkpoint" or header.get("version") != 1:
+            raise CheckpointError(f"{path}: not a tdgc checkpoint of version 1")
+        if hashlib.sha256(data).hexdigest() != header["sha256"]:
+            raise CheckpointError(f"{path}: its checksum does not match, it is damaged")
+        return safetensors.torch.load(data), header
+    except (OSError, ValueError, AttributeError, KeyError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"{path}: cannot be read: {error}") from error
+
+
+def newest_checkpoint(
+    run: Path, warn: Callable[[str], None]
+) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
+    """The newest checkpoint of a run that can be read; damaged ones are passed over with a word.
+
+    Raises:
+        CheckpointError: the run has none.
+    """
+    for path in sorted((run / "checkpoints").glob("step-*"), reverse=True):
+        try:
+            return read_checkpoint(path)
+        except CheckpointError as error:
+            warn(f"{error}; trying the one before")
+    raise CheckpointError(f"{run}: no checkpoint that can be read")
+
+
+def load_learner(
+    model: BaseAlgorithm, tensors: dict[str, th.Tensor], header: dict[str, Any]
+) -> None:
+    """Put a checkpoint's parameters, optimiser, counters and random states into ``model``.
+
+    Raises:
+        CheckpointError: parameters of another shape or name.
+    """
+    try:
+        model.policy.load_state_dict(
+            {k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")}
+        )
+        state = model.policy.optimizer.state_dict()
+        state["state"] = {}
+        for key, value in tensors.items():
+            if key.startswith("optimizer."):
+                _, index, slot = key.split(".")
+                state["state"].setdefault(int(index), {})[slot] = value
+        model.policy.optimizer.load_state_dict(state)
+    except (RuntimeError, KeyError, ValueError) as error:
+        line = str(error).splitlines()[0]
+        raise CheckpointError(f"the checkpoint does not fit the configuration: {line}") from error
+    model.num_timesteps = int(header["num_timesteps"])
+    model._n_updates = int(header["n_updates"])  # type: ignore[attr-defined]
+    _restore_random(tensors, header["random"])
+
+
+# ---------------------------------------------------------------------------- the loop
+
+
+class Interruption:
+    """Turns SIGINT, SIGTERM and a time limit into one flag that the loop looks at."""
+
+    def __init__(self, time_limit: float | None) -> None:
+        self.reason: str | None = None
+        self._deadline = None if time_limit is None else time.monotonic() + time_limit
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self.reason is not None:  # asked twice: stop at once
+            raise KeyboardInterrupt
+        self.reason = signal.Signals(number).name
+
+    def due(self) -> bool:
+        """Whether to stop now."""
+        if self.reason is None and self._deadline is not None:
+            if time.monotonic() > self._deadline:
+                self.reason = "the time limit"
+        return self.reason is not None
+
+
+class RunCallback(BaseCallback):
+    """Progress, logs and checkpoints of a run.
+
+    Args:
+        run: its folder.
+        env: the workers.
+        meta: goes into the policy's file: configuration, seed.
+        summarise: (sums of all workers) -> values to log.
+        interruption: when to stop.
+        seconds_before: wall time of the run so far.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        env: TaskVecEnv,
+        meta: dict[str, Any],
+        summarise: Callable[[dict[str, float]], dict[str, float]],
+        interruption: Interruption,
+        log_steps: int,
+        checkpoint_seconds: float,
+        total_steps: int,
+        seconds_before: float = 0.0,
+        phase: int = 0,
+    ) -> None:
+        super().__init__()
+        self.run, self.env, self.meta = run, env, meta
+        self.summarise, self.interruption = summarise, interruption
+        self.log_steps, self.checkpoint_seconds = log_steps, checkpoint_seconds
+        self.total_steps = total_steps
+        self.phase = phase
+        self._started = time.monotonic() - seconds_before
+        self._saved = time.monotonic()
+        self._logged_at = (0, 0.0)
+        self._bar: Any = None
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the run, over all its pieces."""
+        return time.monotonic() - self._started
+
+    def _on_training_start(self) -> None:
+        self._logged_at = (self.num_timesteps, self.seconds)
+        self._bar = tqdm(
+            total=self.total_steps,
+            initial=self.num_timesteps,
+            unit="step",
+            unit_scale=True,
+            mininterval=2.0,
+            dynamic_ncols=True,
+        )
+
+    def _on_rollout_start(self) -> None:
+        # Between an update and the next rollout the learner's state is whole.
+        if time.monotonic() - self._saved > self.checkpoint_seconds:
+            self.checkpoint()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._bar.update(self.num_timesteps - self._bar.n)
+        if self.num_timesteps - self._logged_at[0] >= self.log_steps:
+            self._log()
+
+    def checkpoint(self) -> None:
+        """Save everything and start all episodes anew, as a resumed run would."""
+        states = self.env.state_dicts()
+        extra = {"workers": states, "seconds": self.seconds, "phase": self.phase}
+        save_checkpoint(self.run / "checkpoints", self.model, extra)
+        meta = {**self.meta, "steps": self.num_timesteps, "seconds": round(self.seconds)}
+        policies.save(self.run / "policy", self.model.policy, meta)
+        restart(self.model, self.env)
+        self._saved = time.monotonic()
+
+    def _log(self) -> None:
+        sums: dict[str, float] = {}
+        stats = self.env.stats()
+        for part in stats:
+            for key, value in part.items():
+                sums[key] = sums.get(key, 0.0) + value
+        sums["workers"] = float(len(stats))
+        values = self.summarise(sums)
+        steps, seconds = self._logged_at
+        values["time/steps_per_s"] = (self.num_timesteps - steps) / (self.seconds - seconds)
+        lengths = [e["l"] for e in self.model.ep_info_buffer or ()]
+        if lengths:
+            returns = [e["r"] for e in self.model.ep_info_buffer or ()]
+            values["episode/return"] = float(np.mean(returns))
+            values["episode/length"] = float(np.mean(lengths))
+        for name in ("value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "std"):
+            value = self.logger.name_to_value.get(f"train/{name}")
+            if value is not None:
+                values[f"train/{name}"] = float(value)
+        for key, value in values.items():
+            self.logger.record(key, value)
+        self.logger.dump(self.num_timesteps)
+        row = {"steps": self.num_timesteps, "seconds": round(self.seconds, 1), **values}
+        with open(self.run / "log.jsonl", "a", encoding="utf-8") as file:
+            file.write(json.dumps({k: _short(v) for k, v in row.items()}) + "\n")
+        self._logged_at = (self.num_timesteps, self.seconds)
+
+    def _on_training_end(self) -> None:
+        self._bar.close()
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def restart(model: BaseAlgorithm, env: TaskVecEnv) -> None:
+    """Begin new episodes everywhere; the learner forgets the observations it held."""
+    model._last_obs = env.reset()
+    model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)  # type: ignore[attr-defined]
+    model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
+
+
+def learn(model: Any, callback: RunCallback, until: int) -> bool:
+    """SB3's learning loop, up to ``until`` steps; False when it was interrupted.
+
+    Like ``OnPolicyAlgorithm.learn``, but it stops between two updates and never inside one, so
+    that a checkpoint written then is whole.
+    """
+    model._total_timesteps = until
+    callback.init_callback(model)
+    callback.on_training_start(locals(), globals())
+    while model.num_timesteps < until and not callback.interruption.due():
+        model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+        model._update_current_progress_remaining(model.num_timesteps, until)
+        model.train()
+    callback.on_training_end()
+    return bool(model.num_timesteps >= until)
+
+
+def tensorboard_logger(folder: Path) -> Logger:
+    """SB3's logger, writing TensorBoard's event files only."""
+    from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+    return Logger(str(folder), [TensorBoardOutputFormat(str(folder))])

@@ -1,0 +1,336 @@
+"""A Bullet world of M robots: the only module that imports pybullet.
+
+Robots pass through each other (a collision mask). Arrays have a leading axis of M robots.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import pybullet
+from numpy.typing import ArrayLike, NDArray
+
+from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.robot import (
+    FOOT_RADIUS,
+    JOINTS,
+    NUM_JOINTS,
+    TRUNK_MASS,
+    Array,
+    RobotState,
+    pd_torque,
+    urdf_path,
+)
+from tdgc.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
+
+_GROUND, _ROBOT = 1, 2  # collision groups: robots meet the ground and nothing else
+GRAVITY = 9.81  # m/s^2
+_FOOT_REACH = 0.03  # m below the foot's centre sits a contact that is the foot's, not the calf's
+
+
+class _Client:
+    """pybullet's functions bound to one connection.
+
+    pybullet_utils' BulletClient binds anew at every call, which costs as much as a short call; here
+    each function is bound once, at its first use.
+    """
+
+    def __init__(self, mode: int, first_row: int) -> None:
+        self.id: int = pybullet.connect(mode)
+        self.first_row = first_row  # of the world's robots
+        self.rows: dict[int, int] = {}  # row of the world that a body of this client is
+        self.ground = -1
+        self.shape = -1
+        self.samples = slice(0, 0)  # of the field along x, that this client holds
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        bound = functools.partial(getattr(pybullet, name), physicsClientId=self.id)
+        setattr(self, name, bound)
+        return bound
+
+
+#: Robots a Bullet client. Bullet walks all constraints of a client for each robot's island, so the
+#: time a robot takes grows with their number: measured on a plane 44 us a step with 5 in a client,
+#: 46 with 10, 54 with 25, 75 with 50, 122 with 100.
+CLIENT_ROBOTS = 10
+
+
+class World:
+    """M robots on a plane or on a field of tiles, one tile row a robot or all on one field.
+
+    Robots are spread over several Bullet clients, ``CLIENT_ROBOTS`` in each; on a field with one
+    tile row a robot, a client holds its own robots' rows only.
+
+    Attributes:
+        state: the ``RobotState`` after the last step or reset.
+        strength: (M, 1) motor strength, times gains and torque limits.
+        bullet_seconds: wall time spent inside Bullet's step so far.
+    """
+
+    def __init__(
+        self,
+        num_robots: int,
+        robot: RobotConfig,
+        physics: PhysicsConfig,
+        field: TileField | None = None,
+        gui: bool = False,
+    ) -> None:
+        if field is not None and field.shape[0] != num_robots:
+            raise ValueError(f"{num_robots} robots need as many tile rows, not {field.shape[0]}")
+        self.num_robots = num_robots
+        self.robot = robot
+        self.physics = physics
+        self.field = field
+        self.strength = np.ones((num_robots, 1))
+        self.bullet_seconds = 0.0
+        self.state = RobotState.zeros(num_robots)
+        self._clients: list[_Client] = []
+        self._bodies: list[int] = []
+        self._client_of: list[_Client] = []
+        parts = -(-num_robots // CLIENT_ROBOTS)
+        for rows in np.array_split(np.arange(num_robots), parts):
+            client = _Client(pybullet.GUI if gui else pybullet.DIRECT, int(rows[0]))
+            client.setGravity(0.0, 0.0, -GRAVITY)
+            # No early stop of the solver: it would couple robots through the worst residual.
+            client.setPhysicsEngineParameter(
+                fixedTimeStep=physics.dt,
+                numSolverIterations=physics.solver_iterations,
+                solverResidualThreshold=0.0,
+                deterministicOverlappingPairs=1,
+            )
+            self._make_ground(client, len(rows))
+            for k in range(len(rows)):
+                self._bodies.append(self._load_robot(client, k))
+                self._client_of.append(client)
+                client.rows[self._bodies[-1]] = int(rows[k])
+            self._clients.append(client)
+        self._trunk_inertia = np.array(
+            self._client_of[0].getDynamicsInfo(self._bodies[0], -1)[2]
+        )
+
+    def _make_ground(self, client: _Client, count: int) -> None:
+        if self.field is None:
+            shape = client.createCollisionShape(pybullet.GEOM_PLANE)
+            client.ground = client.createMultiBody(0.0, shape)
+        else:
+            n = TILE_SAMPLES
+            client.samples = slice(client.first_row * n, (client.first_row + count) * n)
+            heights = self.field.heights[client.samples]
+            # The first upload fixes the height range that Bullet keeps, so it spans all that
+            # tiles can ever be; the second brings the heights.
+            spanning = np.zeros_like(heights)
+            spanning[0, 0], spanning[0, 1] = HEIGHT_RANGE
+            client.shape = self._upload(client, spanning, -1)
+            nx, ny = heights.shape
+            cell = self.field.cell
+            centre = [
+                (client.samples.start + 0.5 * (nx - 1)) * cell,
+                0.5 * (ny - 1) * cell,
+                0.5 * (HEIGHT_RANGE[0] + HEIGHT_RANGE[1]),
+            ]
+            # A visual of its own, or Bullet keeps 360 bytes a sample to draw the field.
+            dot = client.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001)
+            client.ground = client.createMultiBody(0.0, client.shape, dot, basePosition=centre)
+            self._upload(client, heights, client.shape)
+        client.changeDynamics(client.ground, -1, lateralFriction=1.0)  # feet carry the friction
+        client.setCollisionFilterGroupMask(client.ground, -1, _GROUND, _ROBOT)
+
+    def _upload(self, client: _Client, heights: NDArray[np.float32], replace: int) -> int:
+        """Send heights to Bullet, which checks neither sizes nor range, so this does."""
+        assert self.field is not None
+        if heights.size > MAX_SAMPLES:
+            raise ValueError(f"Bullet holds {MAX_SAMPLES} samples a field, not {heights.size}")
+        low, high = float(heights.min()), float(heights.max())
+        if low < HEIGHT_RANGE[0] or high > HEIGHT_RANGE[1]:
+            raise ValueError(f"heights {low:.2f}..{high:.2f} m leave {HEIGHT_RANGE} m")
+        return int(
+            client.createCollisionShape(
+                pybullet.GEOM_HEIGHTFIELD,
+                meshScale=[self.field.cell, self.field.cell, 1.0],
+                heightfieldData=heights.T.ravel(),  # Bullet's rows run along x
+                numHeightfieldRows=heights.shape[0],
+                numHeightfieldColumns=heights.shape[1],
+                replaceHeightfieldIndex=replace,
+            )
+        )
+
+    def upload_terrain(self) -> None:
+        """Bring the field's heights, redrawn in place, into Bullet.
+
+        Raises:
+            ValueError: heights outside the range that the field was made for.
+        """
+        assert self.field is not None, "a plane has no heights"
+        for client in self._clients:
+            self._upload(client, self.field.heights[client.samples], client.shape)
+
+    def _load_robot(self, client: _Client, place: int) -> int:
+        # Apart and high, so that nothing touches before the first reset.
+        body = client.loadURDF(
+            str(urdf_path(self.robot)),
+            basePosition=[2.0 * place, 0.0, 50.0],
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+        )
+        found = {
+            client.getJointInfo(body, j)[1].decode(): j for j in range(client.getNumJoints(body))
+        }
+        missing = [name for name in JOINTS if name not in found]
+        if missing:
+            raise ValueError(f"{self.robot.urdf} lacks the joints {', '.join(missing)}")
+        self._joints = [found[name] for name in JOINTS]
+        self._leg_of_link = {j: i // 3 for i, j in enumerate(self._joints)}
+        self._calf_links = {self._joints[3 * leg + 2] for leg in range(4)}
+        # Bullet holds one speed limit a body: the fastest joint's. ``pd_torque`` keeps the others.
+        fastest = max(self.robot.speed_limit)
+        for link in range(-1, client.getNumJoints(body)):
+            client.setCollisionFilterGroupMask(body, link, _ROBOT, _GROUND)
+            client.changeDynamics(
+                body,
+                link,
+                linearDamping=0.0,
+                angularDamping=0.0,
+                jointDamping=0.0,
+                lateralFriction=self.physics.friction,
+                maxJointVelocity=fastest,
+            )
+        # Bullet's default velocity motors would hold the joints.
+        client.setJointMotorControlArray(
+            body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * NUM_JOINTS
+        )
+        return int(body)
+
+    def reset_robots(
+        self,
+        index: Iterable[int] | NDArray[np.integer],
+        position: Array,
+        quaternion: Array,
+        q: Array,
+    ) -> None:
+        """Put the robots ``index`` (n,) at rest at ``position`` (n, 3), ``quaternion`` (n, 4)
+        with joint angles ``q`` (n, 12); refreshes ``state``."""
+        state = self.state
+        for k, i in enumerate(index):
+            body, client = self._bodies[i], self._client_of[i]
+            client.resetBasePositionAndOrientation(body, position[k], quaternion[k])
+            client.resetBaseVelocity(body, [0.0] * 3, [0.0] * 3)
+            for joint, angle in zip(self._joints, q[k], strict=True):
+                client.resetJointState(body, joint, angle, 0.0)
+            state.position[i], state.quaternion[i], state.q[i] = position[k], quaternion[k], q[k]
+            for still in (state.lin_vel, state.ang_vel, state.qd, state.torque):
+                still[i] = 0.0
+            state.foot_force[i] = state.leg_force[i] = 0.0
+            state.trunk_force[i] = 0.0
+        state.derive()
+
+    def set_dynamics(self, index: ArrayLike, friction: Array, payload: Array) -> None:
+        """Friction of every link and extra mass of the trunk, (n,) and (n,) kg."""
+        for k, i in enumerate(np.asarray(index)):
+            body, client = self._bodies[i], self._client_of[i]
+            mass = TRUNK_MASS + float(payload[k])
+            for link in range(-1, NUM_JOINTS):
+                client.changeDynamics(body, link, lateralFriction=float(friction[k]))
+            # Spread over the trunk, the payload scales its inertia.
+            client.changeDynamics(
+                body,
+                -1,
+                mass=mass,
+                localInertiaDiagonal=(self._trunk_inertia * (mass / TRUNK_MASS)).tolist(),
+            )
+
+    def push(self, index: ArrayLike, velocity: Array) -> None:
+        """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index``."""
+        for k, i in enumerate(np.asarray(index)):
+            body, client = self._bodies[i], self._client_of[i]
+            linear, angular = client.getBaseVelocity(body)
+            client.resetBaseVelocity(body, np.add(linear, velocity[k]), angular)
+
+    def step(self, targets: Array, delay: Array, offset: Array) -> None:
+        """One control step of PD control.
+
+        Args:
+            targets: (H, M, 12) rad, the joint targets of this control step and the H-1 before.
+            delay: (M,) s from a decision to its effect, below H control steps.
+            offset: (M, 12) rad, error of each joint's zero.
+        """
+        joints, robots = self._joints, list(zip(self._client_of, self._bodies, strict=True))
+        dt, control_dt = self.physics.dt, self.physics.control_dt
+        rows = np.arange(self.num_robots)
+        trunk_force = np.zeros(self.num_robots)
+        q, qd = self.state.q, self.state.qd
+        for k in range(self.physics.substeps):
+            age = np.ceil(np.maximum(delay - k * dt - 1e-9, 0.0) / control_dt).astype(int)
+            torque = pd_torque(targets[age, rows] + offset - q, qd, self.strength, self.robot)
+            for (client, body), forces in zip(robots, torque.tolist(), strict=True):
+                client.setJointMotorControlArray(
+                    body, joints, pybullet.TORQUE_CONTROL, forces=forces
+                )
+            started = time.perf_counter()
+            for client in self._clients:
+                client.stepSimulation()
+            self.bullet_seconds += time.perf_counter() - started
+            flat = [s for client, body in robots for s in client.getJointStates(body, joints)]
+            q = np.array([s[0] for s in flat]).reshape(-1, NUM_JOINTS)
+            qd = np.array([s[1] for s in flat]).reshape(-1, NUM_JOINTS)
+            force = np.zeros(self.num_robots)
+            for client in self._clients:
+                for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=-1):
+                    force[client.rows[contact[2]]] += contact[9]
+            np.maximum(trunk_force, force, out=trunk_force)
+        state = self.state
+        state.q, state.qd, state.torque, state.trunk_force = q, qd, torque, trunk_force
+        bases = [client.getBasePositionAndOrientation(body) for client, body in robots]
+        speeds = [client.getBaseVelocity(body) for client, body in robots]
+        state.position = np.array([b[0] for b in bases])
+        state.quaternion = np.array([b[1] for b in bases])
+        state.lin_vel = np.array([s[0] for s in speeds])
+        state.ang_vel = np.array([s[1] for s in speeds])
+        state.derive()
+        self._read_contacts()
+
+    def _read_contacts(self) -> None:
+        """Forces of the last physics step, split into feet and the legs above them.
+
+        The foot is the end of the calf link, so a calf contact counts as the foot's when it is
+        within reach of the foot's centre.
+        """
+        state = self.state
+        state.foot_force = np.zeros((self.num_robots, 4))
+        state.leg_force = np.zeros((self.num_robots, 4))
+        contacts = [
+            (client.rows[contact[2]], contact)
+            for client in self._clients
+            for contact in client.getContactPoints(bodyA=client.ground)
+        ]
+        for row, contact in contacts:
+            force, link = contact[9], contact[4]
+            if force <= 0.0 or link < 0:
+                continue
+            leg = self._leg_of_link[link]
+            if link in self._calf_links:
+                foot = state.foot_position[row, leg]
+                point = contact[6]
+                away = (
+                    (point[0] - foot[0]) ** 2 + (point[1] - foot[1]) ** 2 + (point[2] - foot[2]) ** 2
+                )
+                if away < (FOOT_RADIUS + _FOOT_REACH) ** 2:
+                    state.foot_force[row, leg] += force
+                    continue
+            state.leg_force[row, leg] += force
+
+    def ground_height(self, x: Array, y: Array) -> Array:
+        """Surface height in m under points of any shape."""
+        return np.zeros_like(x) if self.field is None else self.field.height_at(x, y)
+
+    def support_height(self, x: Array, y: Array) -> Array:
+        """Height in m of the support surface of the fall rule: trenches filled, no pillars."""
+        return np.zeros_like(x) if self.field is None else self.field.support_at(x, y)
+
+    def close(self) -> None:
+        """Disconnect from Bullet; the world is of no use afterwards."""
+        for client in self._clients:
+            client.disconnect()
+        self._clients.clear()

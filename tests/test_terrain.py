@@ -1,0 +1,416 @@
+"""Terrain tiles against the numbers of Sec. III-A and TDGC-Bench."""
+
+import math
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+
+from tdgc import terrain
+from tdgc.terrain import (
+    ALL_FAMILIES,
+    EVAL_STREAM,
+    FAMILIES,
+    TRAIN_STREAM,
+    TerrainGrid,
+    Tile,
+    difficulty_parameter,
+    draw_start_goal,
+    make_tile,
+    tile_rng,
+)
+
+DIFFICULTIES = [level / 10 for level in range(13)]
+MIDDLE = 80  # sample at x = 4 m or y = 4 m
+
+
+def tile(family: str, difficulty: float, seed: int = 0) -> Tile:
+    return make_tile(family, difficulty, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(
+    ("family", "at_0", "at_1", "at_12"),
+    [
+        ("rough", 0.01, 0.08, 0.094),
+        ("pillar", 4, 24, 28),
+        ("stair", 0.03, 0.13, 0.15),
+        ("gap", 0.05, 0.25, 0.29),
+        ("tilt", 0.0, 0.40, 0.48),
+    ],
+)
+def test_difficulty_parameter_is_affine(family, at_0, at_1, at_12):
+    assert difficulty_parameter(family, 0) == at_0
+    assert difficulty_parameter(family, 1) == pytest.approx(at_1, abs=1e-12)
+    assert difficulty_parameter(family, 0.5) == pytest.approx((at_0 + at_1) / 2, abs=1e-12)
+    assert difficulty_parameter(family, 1.2) == pytest.approx(at_12, abs=1e-12)
+
+
+# What every tile shares
+
+
+@pytest.mark.parametrize("family", ALL_FAMILIES)
+@pytest.mark.parametrize("difficulty", DIFFICULTIES)
+def test_every_tile_is_flat_on_its_platforms_and_within_range(family, difficulty):
+    for seed in range(3):
+        made = tile(family, difficulty, seed)
+        assert made.heights.shape == made.support.shape == (161, 161)
+        assert made.heights.dtype == made.support.dtype == np.float32
+        assert made.cell == 0.05 and made.family == family and made.difficulty == difficulty
+        for surface in (made.heights, made.support):
+            assert (surface[:26] == 0).all()  # x <= 1.25
+            assert (surface[135:] == 0).all()  # x >= 6.75
+            low, high = terrain.HEIGHT_RANGE
+            assert low < surface.min() and surface.max() < high
+
+
+def test_only_trenches_and_pillars_are_not_ground():
+    for family in ("rough", "stair", "tilt"):
+        made = tile(family, 1)
+        np.testing.assert_array_equal(made.support, made.heights)
+    for family in ("pillar", "gap"):
+        made = tile(family, 1)
+        assert made.heights.any() and not made.support.any()
+
+
+def test_start_and_goal_fill_their_ranges():
+    start, goal = draw_start_goal(np.random.default_rng(0), (10_000,))
+    assert start.shape == (10_000, 3) and goal.shape == (10_000, 2)
+    assert (start[:, 0] == 0.75).all() and (goal[:, 0] == 7.25).all()
+    for drawn, low, high in [(start[:, 1], 3, 5), (start[:, 2], -0.5, 0.5), (goal[:, 1], 3, 5)]:
+        assert low <= drawn.min() < low + 0.01 and high - 0.01 < drawn.max() <= high
+    made = tile("rough", 0)
+    assert made.start.shape == (3,) and made.goal.shape == (2,)
+    assert made.start[0] == 0.75 and made.goal[0] == 7.25
+
+
+@pytest.mark.parametrize("family", ALL_FAMILIES)
+def test_same_seed_same_tile(family):
+    one, same, other = tile(family, 0.7, 1), tile(family, 0.7, 1), tile(family, 0.7, 2)
+    for name in ("heights", "support", "start", "goal"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
+    assert one.parts == same.parts
+    assert (one.start != other.start).any()
+    if family in ("rough", "pillar"):  # the only ones whose surface is random
+        assert (one.heights != other.heights).any()
+
+
+def test_a_tile_is_frozen():
+    with pytest.raises(FrozenInstanceError):
+        tile("rough", 0).family = "stair"
+
+
+@pytest.mark.parametrize("difficulty", [-0.01, 1.21, math.nan, math.inf, -math.inf])
+def test_bad_difficulty_names_the_range(difficulty):
+    with pytest.raises(ValueError, match=r"difficulty must lie in \[0, 1\.2\], got"):
+        tile("rough", difficulty)
+    with pytest.raises(ValueError, match=r"difficulty must lie in"):
+        difficulty_parameter("rough", difficulty)
+
+
+def test_bad_family_names_the_families():
+    with pytest.raises(ValueError, match="'stairs'; choose from rough, pillar, .*, mixed$"):
+        tile("stairs", 0.5)
+    with pytest.raises(ValueError, match="'mixed'; choose from rough, .*, tilt$"):
+        difficulty_parameter("mixed", 0.5)
+
+
+# Family by family
+
+
+@pytest.mark.parametrize(("difficulty", "amplitude"), [(0, 0.01), (0.5, 0.045), (1, 0.08)])
+def test_rough_is_zero_mean_and_reaches_its_amplitude(difficulty, amplitude):
+    for seed in range(5):
+        heights = tile("rough", difficulty, seed).heights
+        zone = heights[30:131].astype(float)
+        assert abs(zone.mean()) < 1e-6
+        assert np.abs(zone).max() == pytest.approx(amplitude, rel=1e-6)
+        assert np.abs(heights).max() <= np.float32(amplitude)
+        assert zone.std() > 0.2 * amplitude  # noise, not one peak
+
+
+def test_rough_is_bilinear_between_lattice_nodes():
+    zone = tile("rough", 1).heights[32:129].astype(float)  # nodes every 4 samples
+    along_x, along_y = np.diff(zone, axis=0), np.diff(zone, axis=1)
+    np.testing.assert_allclose(along_x[0::4], along_x[3::4], atol=1e-7)
+    np.testing.assert_allclose(along_y[:, 0::4], along_y[:, 3::4], atol=1e-7)
+    assert np.abs(along_x[3:-1:4] - along_x[4::4]).max() > 0.01  # and bends at the nodes
+
+
+def test_rough_blends_in_and_out_linearly():
+    blended = tile("rough", 1).heights
+    weights = np.abs(blended).max(axis=1) / 0.08
+    for near, far in [(25, 135), (26, 134), (27, 133), (28, 132), (29, 131)]:
+        limit = (near - 25) / 5
+        assert weights[near] <= limit + 1e-6 and weights[far] <= limit + 1e-6
+        assert (limit == 0) or (weights[near] > limit / 3 and weights[far] > limit / 3)
+
+
+@pytest.mark.parametrize(
+    ("difficulty", "count"), [(0, 4), (0.5, 14), (1, 24), (1.1, 26), (1.2, 28)]
+)
+def test_pillar_count_and_height(difficulty, count):
+    heights = tile("pillar", difficulty).heights
+    assert set(np.unique(heights)) == {np.float32(0), np.float32(0.8)}
+    assert (heights[:31] == 0).all() and (heights[130:] == 0).all()
+    assert count_blobs(heights > 0) == count
+
+
+def test_pillars_keep_clear_and_inside():
+    for seed in range(40):
+        x, y, d = terrain.place_pillars(terrain.WHOLE_ZONE, 28, np.random.default_rng(seed)).T
+        assert len(x) == 28
+        assert d.min() >= 0.2 and d.max() <= 0.4 and np.ptp(d) > 0.1
+        assert (x - d / 2).min() >= 1.5 and (x + d / 2).max() <= 6.5
+        assert (y - d / 2).min() >= 0 and (y + d / 2).max() <= 8
+        way = np.hypot(x[:, None] - x, y[:, None] - y) - (d[:, None] + d) / 2
+        assert way[~np.eye(28, dtype=bool)].min() >= 0.6
+
+
+def test_pillars_that_cannot_fit_raise():
+    narrow = terrain.Section(1.5, 1.5, 2.0, 2.0)
+    with pytest.raises(RuntimeError, match="no room for 28 pillars"):
+        terrain.place_pillars(narrow, 28, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("difficulty", "step"), [(0, 0.03), (0.5, 0.08), (1, 0.13), (1.2, 0.15)])
+def test_stair_heights_are_exact(difficulty, step):
+    heights = tile("stair", difficulty).heights
+    assert (heights == heights[:, :1]).all()  # the same all across
+    profile = heights[:, 0]
+    up = np.repeat(np.arange(1, 9), 6)[:44]  # 8 treads of 6 cells, the last runs into the landing
+    expected = np.zeros(161)
+    expected[31:75] = up
+    expected[75:81] = 8
+    expected[80:] = expected[80::-1]
+    np.testing.assert_array_equal(profile, (expected * step).astype(np.float32))
+    risers = np.flatnonzero(np.diff(profile) > 0)  # the cell from this sample to the next
+    np.testing.assert_allclose(risers * 0.05, 1.5 + 0.3 * np.arange(8), atol=1e-9)
+    np.testing.assert_array_equal(profile, profile[::-1])
+
+
+@pytest.mark.parametrize(
+    ("level", "lowered"), list(enumerate([1, 1, 2, 2, 3, 3, 3, 4, 4, 5, 5, 5, 6]))
+)
+def test_gap_trenches(level, lowered):
+    heights = tile("gap", level / 10).heights
+    assert (heights == heights[:, :1]).all()  # across the whole tile
+    profile = heights[:, 0]
+    assert set(np.unique(profile)) == {np.float32(-0.6), np.float32(0)}
+    deep = np.flatnonzero(profile).reshape(4, lowered)
+    assert (np.diff(deep, axis=1) == 1).all()
+    middles = (deep[:, 0] + deep[:, -1]) / 2 * 0.05
+    shift = 0.025 * (lowered % 2)
+    np.testing.assert_allclose(middles + shift, [2.125, 3.375, 4.625, 5.875], atol=1e-9)
+    # The opening at half depth is the parameter w, to half a cell.
+    assert abs(lowered * 0.05 - difficulty_parameter("gap", level / 10)) <= 0.025 + 1e-9
+
+
+def test_tilt_slopes_sideways_and_blends_over_half_a_metre():
+    assert not tile("tilt", 0).heights.any()
+    heights = tile("tilt", 1).heights
+    slope = math.tan(0.4)
+    for ix in (35, 60, 80, 125):  # x = 1.75 ... 6.25
+        assert heights[ix, 0] == pytest.approx(-4 * slope, abs=1e-6)
+        assert heights[ix, 80] == 0
+        assert heights[ix, 100] == pytest.approx(slope, abs=1e-6)
+        assert heights[ix, 160] == pytest.approx(4 * slope, abs=1e-6)
+    ramp = np.arange(11) / 10 * slope  # at y = 5, x = 1.25 ... 1.75
+    np.testing.assert_allclose(heights[25:36, 100], ramp, atol=1e-6)
+    np.testing.assert_allclose(heights[125:136, 100], ramp[::-1], atol=1e-6)
+
+
+# Mixed
+
+
+def family_of(half: np.ndarray) -> str:
+    """Tell the family from the heights of half a zone at d = 0.8."""
+    if half.min() == np.float32(-0.6):
+        return "gap"
+    if (half == half[:, :1]).all():
+        return "stair"
+    if half.max() == np.float32(0.8) and half.min() == 0:
+        return "pillar"
+    return "tilt" if half.max() > 1 else "rough"
+
+
+def test_mixed_is_two_different_families_half_a_zone_each():
+    pairs = set()
+    for seed in range(120):
+        made = tile("mixed", 0.8, seed)
+        halves = made.heights[30:81], made.heights[80:131]
+        assert made.parts == tuple(family_of(half) for half in halves)
+        assert (made.heights[MIDDLE] == 0).all()  # level where they meet
+        pairs.add(made.parts)
+    assert pairs == {(a, b) for a in FAMILIES for b in FAMILIES if a != b}  # all 20
+
+
+def mixed_half(family: str, difficulty: float) -> np.ndarray:
+    """Heights of the first half, from the first tile that has `family` there."""
+    seeds = (s for s in range(1000) if tile("mixed", difficulty, s).parts[0] == family)
+    return tile("mixed", difficulty, next(seeds)).heights[:81]
+
+
+def test_mixed_halves_have_the_same_parameters():
+    rough_half = mixed_half("rough", 1)[30:76].astype(float)  # to where it blends out
+    assert np.abs(rough_half).max() == pytest.approx(0.08, rel=1e-6)
+    assert abs(rough_half.mean()) < 1e-6
+    assert count_blobs(mixed_half("pillar", 1) > 0) == 12  # half the zone, half of 24
+    stair_half = mixed_half("stair", 1)[:, 0]
+    assert stair_half.max() == np.float32(4 * 0.13)
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(stair_half) > 0), [30, 36, 42, 48])
+    np.testing.assert_array_equal(mixed_half("gap", 1), tile("gap", 1).heights[:81])
+    tilt_half = mixed_half("tilt", 1)[:, 100]
+    np.testing.assert_array_equal(tilt_half[:71], tile("tilt", 1).heights[:71, 100])
+    np.testing.assert_allclose(
+        tilt_half[70:], np.arange(10, -1, -1) / 10 * math.tan(0.4), atol=1e-6
+    )
+
+
+def test_mixed_support_drops_only_trenches_and_pillars():
+    for seed in range(60):
+        made = tile("mixed", 1, seed)
+        for part, half in zip(made.parts, (slice(None, 81), slice(80, None)), strict=True):
+            ground = 0 if part in ("gap", "pillar") else made.heights[half]
+            assert (made.support[half] == ground).all()
+
+
+# Seeds
+
+
+def test_streams_and_tiles_have_their_own_seeds():
+    keys = [
+        (seed, family, level, index, stream)
+        for seed in (0, 1)
+        for family in ("rough", "gap")
+        for level in (0, 10)
+        for index in (0, 1)
+        for stream in (TRAIN_STREAM, EVAL_STREAM)
+    ]
+    assert len({tile_rng(*key).random() for key in keys}) == len(keys)
+    assert tile_rng(7, "rough", 3, 5).random() == tile_rng(7, "rough", 3, 5, TRAIN_STREAM).random()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_seeds_must_be_one_word(seed):
+    with pytest.raises(ValueError, match=r"must lie in \[0, 2\*\*32\)"):
+        tile_rng(seed, "rough", 0, 0)
+
+
+# The grid
+
+
+@pytest.fixture(scope="module")
+def grid() -> TerrainGrid:
+    return TerrainGrid.build((2, 7), ("stair", "rough", "mixed"), seed=3)
+
+
+def test_grid_rows_are_levels_and_columns_families(grid):
+    assert grid.shape == (2, 3)
+    assert grid.heights.shape == grid.support.shape == (322, 483)
+    assert grid.heights.dtype == np.float32 and grid.heights.flags.c_contiguous
+    assert grid.extent == (pytest.approx(16.05), pytest.approx(24.10))
+    for row, level in enumerate((2, 7)):
+        for col, family in enumerate(("stair", "rough", "mixed")):
+            made = make_tile(family, level / 10, tile_rng(3, family, level, 0))
+            where = np.s_[161 * row : 161 * (row + 1), 161 * col : 161 * (col + 1)]
+            np.testing.assert_array_equal(grid.heights[where], made.heights)
+            np.testing.assert_array_equal(grid.support[where], made.support)
+            np.testing.assert_array_equal(grid.starts[row, col], made.start)
+            np.testing.assert_array_equal(grid.goals[row, col], made.goal)
+            np.testing.assert_allclose(grid.origin(row, col), [8.05 * row, 8.05 * col])
+
+
+def test_origin_takes_arrays(grid):
+    np.testing.assert_allclose(grid.origin([0, 1], [2, 0]), [[0, 16.1], [8.05, 0]])
+
+
+def test_on_tile(grid):
+    x = 8.05 + np.array([-0.01, 0.01, 7.99, 8.01, 4.0, 4.0, 4.0])
+    y = 16.1 + np.array([4.0, 4.0, 4.0, 4.0, -0.01, 0.01, 8.01])
+    expected = [False, True, True, False, False, True, False]
+    assert grid.on_tile(1, 2, x, y).tolist() == expected
+    np.testing.assert_array_equal(grid.on_tile([1, 0], [2, 2], 12.0, 20.0), [True, False])
+
+
+def test_redraw_keeps_the_buffers_and_draws_new_tiles():
+    grid = TerrainGrid.build((3, 3), ("rough", "pillar"), seed=1, index=[[0], [1]])
+    heights, support, before = grid.heights, grid.support, grid.heights.copy()
+    assert (before[:161] != before[161:]).any()  # one level twice, told apart by the index
+    grid.redraw(2)
+    assert grid.heights is heights and grid.support is support
+    np.testing.assert_array_equal(heights[:161], heights[161:])
+    assert (heights[30:131, :161] != before[30:131, :161]).mean() > 0.9
+    made = make_tile("rough", 0.3, tile_rng(1, "rough", 3, 2))
+    np.testing.assert_array_equal(heights[:161, :161], made.heights)
+    grid.redraw([[0], [1]])
+    np.testing.assert_array_equal(heights, before)
+
+
+def test_training_and_evaluation_grids_differ():
+    train, held_out = (
+        TerrainGrid.build((5,), ("rough",), seed=0, stream=stream)
+        for stream in (TRAIN_STREAM, EVAL_STREAM)
+    )
+    assert (train.heights[30:131] != held_out.heights[30:131]).mean() > 0.9
+
+
+def test_grid_stays_within_bullets_limit():
+    TerrainGrid((0,) * 16, ("rough",) * 5, seed=0)  # 80 tiles
+    with pytest.raises(ValueError, match="1 to 80 tiles .* got 9 x 9"):
+        TerrainGrid((0,) * 9, ("rough",) * 9, seed=0)
+    with pytest.raises(ValueError, match="got 0 x 1"):
+        TerrainGrid.build((), ("rough",), seed=0)
+
+
+def test_grid_checks_levels_and_families():
+    for level in (-1, 13, 2.5):
+        with pytest.raises(ValueError, match="whole numbers from 0 to 12"):
+            TerrainGrid.build((level,), ("rough",), seed=0)
+    with pytest.raises(ValueError, match="unknown terrain family 'ramp'"):
+        TerrainGrid.build((0,), ("ramp",), seed=0)
+
+
+def test_height_at_follows_bullets_triangles():
+    grid = TerrainGrid((0,), ("rough",), seed=0)
+    # One cell with corners a = [4, 6], b = [5, 6], c = [4, 7], e = [5, 7]; its diagonal is b-c.
+    a, b, c, e = 0.1, 0.3, -0.2, 0.7
+    grid.heights[4:6, 6:8] = [[a, c], [b, e]]
+    grid.support[4:6, 6:8] = 1
+    x, y = 4 * 0.05, 6 * 0.05
+    u, v = (
+        np.array([0.0, 1.0, 0.0, 1.0, 0.2, 0.5, 0.8]),
+        np.array([0.0, 0.0, 1.0, 1.0, 0.4, 0.5, 0.6]),
+    )
+    expected = [
+        *(a, b, c, e),
+        a + 0.2 * (b - a) + 0.4 * (c - a),  # triangle a, b, c
+        (b + c) / 2,  # on the diagonal
+        e + 0.2 * (c - e) + 0.4 * (b - e),  # triangle e, c, b
+    ]
+    np.testing.assert_allclose(grid.height_at(x + 0.05 * u, y + 0.05 * v), expected, atol=1e-6)
+    np.testing.assert_allclose(grid.support_at(x + 0.05 * u, y + 0.05 * v), 1, atol=1e-6)
+    assert grid.height_at(x + 0.01, y + 0.02) == pytest.approx(expected[4], abs=1e-6)
+    assert grid.height_at(np.full((5, 2), x), np.full((5, 2), y)).shape == (5, 2)
+
+
+def test_height_at_hits_every_sample_and_clamps_outside(grid):
+    ix, iy = np.meshgrid(np.arange(322), np.arange(483), indexing="ij")
+    np.testing.assert_allclose(grid.height_at(ix * 0.05, iy * 0.05), grid.heights, atol=1e-6)
+    grid = TerrainGrid((0,), ("rough",), seed=0)
+    grid.heights[0, 0], grid.heights[-1, -1], grid.heights[80, -1] = 1, 2, 3
+    assert grid.height_at(-5.0, -5.0) == pytest.approx(1)
+    assert grid.height_at(99.0, 99.0) == pytest.approx(2)
+    assert grid.height_at(4.0, 99.0) == pytest.approx(3)
+
+
+def count_blobs(mask: np.ndarray) -> int:
+    """Number of 4-connected regions."""
+    left, blobs = {tuple(i) for i in np.argwhere(mask)}, 0
+    while left:
+        blobs, edge = blobs + 1, [left.pop()]
+        while edge:
+            i, j = edge.pop()
+            near = {(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)} & left
+            left -= near
+            edge += near
+    return blobs
