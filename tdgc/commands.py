@@ -39,13 +39,6 @@ NUM_COMMANDS = len(NAMES)
 #: Position of each command in the vector, by name.
 INDEX = {name: i for i, name in enumerate(NAMES)}
 
-#: What each command is multiplied by before a network sees it (Walk These Ways; ours for
-#: stance length, width and power, so that each spans about one unit).
-OBSERVATION_SCALE: NDArray[np.float64] = np.array(
-    [2.0, 2.0, 0.25, 2.0, 1.0, 1.0, 0.15, 0.3, 0.3, 1.0, 1.0, 100.0, 1.0, 1.0, 1.0]
-)
-
-
 def default_command() -> NDArray[np.float64]:
     """Standing still in trot with middling behaviour parameters, (15,).
 
@@ -59,6 +52,19 @@ def default_command() -> NDArray[np.float64]:
     command[INDEX["stance_length"]] = 0.38
     command[12:] = gait_embedding(0)
     return command
+
+
+#: Unit in which the networks see a command's distance from its default: about half its range, so
+#: that every input spans about [-1, 1]; the embedding enters as it is.
+_OBSERVATION_UNIT: NDArray[np.float64] = np.array(
+    [1.0, 0.5, 1.0, 0.1, 1.0, 0.1, 0.1, 0.3, 0.2, 0.1, 0.05, 0.002, 0.5, 0.5, 0.5]
+)
+_OBSERVATION_ZERO: NDArray[np.float64] = np.concatenate([default_command()[:12], np.zeros(3)])
+
+
+def observed_command(command: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Commands (..., 15) as the low level's network sees them."""
+    return np.asarray((command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT)
 
 
 class CommandDecoder:

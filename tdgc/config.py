@@ -14,9 +14,9 @@ import types
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
-Range = tuple[float, float]
+Range = typing.Annotated[tuple[float, float], "low <= high"]
 
 
 class ConfigError(ValueError):
@@ -80,7 +80,7 @@ class CommandRanges:
     roll: Range = (-0.2, 0.2)  # rad, left side up positive
     stance_width: Range = (0.20, 0.35)  # m, between left and right footholds
     stance_length: Range = (0.33, 0.43)  # m, between front and rear footholds
-    power_weight: Range = (0.0, 0.005)  # 1/W, the auxiliary: price of mechanical power
+    power_weight: Range = (0.0, 0.002)  # 1/W, the auxiliary: price of mechanical power
 
 
 @dataclass(frozen=True)
@@ -130,16 +130,18 @@ class RandomisationConfig:
     latency: Range = (0.0, 0.03)  # s between decision and effect (real robots: about 30 ms)
     push_speed: float = 0.75  # m/s, largest horizontal push (benchmark's `pushes`)
     push_interval: Range = (3.0, 8.0)  # s between pushes
-    noise_gravity: float = 0.05  # half-width of uniform noise (Walk These Ways)
+    noise_gravity: float = 0.02  # half-width of uniform noise
     noise_joint_angle: float = 0.01  # rad
-    noise_joint_speed: float = 1.5  # rad/s
+    # Walk These Ways has 0.05 and 1.5 rad/s, and 30 steps of history to average them over. An actor
+    # that sees one step needs its joint speeds to tell how fast the trunk moves.
+    noise_joint_speed: float = 0.3  # rad/s
 
 
 @dataclass(frozen=True)
 class LowLevelConfig:
     """The execution-level MDP (Sec. IV-A)."""
 
-    terrain: str = "plane"  # plane | tiles
+    terrain: Literal["plane", "tiles"] = "plane"
     levels: int = 11  # of the curriculum: 0..levels-1
     # Pillar is left out: a level that sees no obstacle can learn nothing of it but bumps.
     families: tuple[str, ...] = ("rough", "stair", "gap", "tilt")
@@ -155,25 +157,76 @@ class LowLevelConfig:
 
 
 @dataclass(frozen=True)
+class HighRewardConfig:
+    """Weights and constants of the high-level reward (Sec. IV-B), one weight per term.
+
+    Weights are per second: ``tdgc.rewards.high_terms`` multiplies them by the step's duration.
+    """
+
+    goal_distance: float = 1.0
+    face: float = 0.2
+    arrive: float = 2.0
+    stable: float = 0.5
+    action_rate: float = -0.01
+    command_rate: float = -0.2
+    command_acceleration: float = -0.1
+    contact_force: float = -0.01
+    laziness: float = -0.5
+    alive: float = 0.1
+    map_radius: float = 8.0  # m, R_map: the tile's length
+    curve_gain: float = 1.0  # a of the goal distance
+    curve_rate: float = 3.0  # b of the goal distance
+    goal_radius: float = 0.5  # m, d_0: the paper's reach distance
+    arrive_base: float = 1.0  # b_0
+    arrive_speed: float = 2.0  # b_1: what an early arrival adds
+    joint_speed_weight: float = 0.05  # beta of eta_t
+    height_scale: float = 0.01  # m^2, sigma_z
+    force_threshold: float = 1.0  # N, F_th
+    lazy_speed: float = 0.1  # m/s, v_th
+
+
+@dataclass(frozen=True)
+class HighLevelConfig:
+    """The decision-level MDP (Sec. IV-B) and its curriculum (Sec. IV-C)."""
+
+    decimation: int = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
+    cues: Literal["both", "semantic", "geometric", "none"] = "both"
+    families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "tilt")
+    levels: int = 11  # L_max: levels 0..10
+    window: int = 10  # W episodes
+    threshold: int = 7  # S successes of them
+    episode_seconds: float = 20.0  # T_max (benchmark)
+    hold_seconds: float = 2.0  # an episode goes on that long after the goal was reached
+    action_limit: float = 1.0  # a_max of the decoder
+    commands: CommandRanges = field(default_factory=CommandRanges)  # the decoder's bounds
+    rewards: HighRewardConfig = field(default_factory=HighRewardConfig)
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
+
+
+@dataclass(frozen=True)
 class PPOConfig:
     """PPO and the networks of the low level; see docs/experiments.md for what was compared."""
 
-    learning_rate: float = 5e-4
-    final_learning_rate: float = 1e-4  # reached linearly at the last step
+    # Times the mean standard deviation of the actions: as exploration shrinks, the same step of the
+    # mean moves the policy further (the clipped share rose from 0.2 to 0.4 at a constant rate).
+    learning_rate: float = 6e-4
+    final_learning_rate: float = 3e-4  # reached linearly at the last step
     n_steps: int = 32  # control steps a robot between updates
-    batch_size: int = 960  # before mirroring: a quarter of a rollout
-    n_epochs: int = 8
+    batch_size: int = 960  # a quarter of a rollout
+    n_epochs: int = 5
     gamma: float = 0.99
     gae_lambda: float = 0.95
     clip_range: float = 0.2
-    ent_coef: float = 0.0
+    ent_coef: float = 0.002
     vf_coef: float = 0.5
     max_grad_norm: float = 1.0
     initial_std: float = 1.0
+    # SB3's 1e-5 swallows the critic's gradients: rewards carry dt and are below 0.03 a step.
+    adam_eps: float = 1e-8
     actor: tuple[int, ...] = (256, 192)
     critic: tuple[int, ...] = (256, 128)
-    activation: str = "elu"
-    mirror: bool = True  # each minibatch also holds its left-right mirror image
+    activation: Literal["elu", "relu", "tanh"] = "elu"
+    mirror: bool = True  # policy and value exactly left-right symmetric
 
 
 @dataclass(frozen=True)
@@ -187,9 +240,44 @@ class LowTrainConfig:
     steps: int = 100_000_000  # altogether
     plane_substeps: int = 4  # on a plane nothing sinks, so 5 ms will do (benchmark, Physics)
     log_steps: int = 100_000
-    checkpoint_seconds: float = 50.0  # an interruption loses at most a minute
+    checkpoint_steps: int = 200_000  # 33 s of every robot; new tiles are drawn that often, too
     env: LowLevelConfig = field(default_factory=LowLevelConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
+
+
+@dataclass(frozen=True)
+class RecurrentPPOConfig:
+    """RecurrentPPO and the networks of the high level; defaults are the paper's table."""
+
+    learning_rate: float = 1e-4
+    n_steps: int = 24  # decisions a robot between updates
+    minibatches: int = 4
+    n_epochs: int = 5
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    ent_coef: float = 1e-4
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+    initial_std: float = 0.6
+    lstm: int = 128
+    actor: tuple[int, ...] = (128,)
+    critic: tuple[int, ...] = (128,)
+
+
+@dataclass(frozen=True)
+class HighTrainConfig:
+    """A run of train_high.py; the first lines are the paper's table."""
+
+    seed: int = 42
+    n_envs: int = 100
+    workers: int = 2
+    steps: int = 10_000_000  # decisions altogether
+    log_steps: int = 24_000
+    checkpoint_steps: int = 240_000  # whole episodes of every robot, ten or so
+    low: str = "tdgc/pretrained/low"
+    env: HighLevelConfig = field(default_factory=HighLevelConfig)
+    ppo: RecurrentPPOConfig = field(default_factory=RecurrentPPOConfig)
 
 
 Config = TypeVar("Config")
@@ -208,7 +296,7 @@ def from_dict(cls: type[Config], data: Mapping[str, Any], where: str = "") -> Co
     """
     if not isinstance(data, Mapping):
         raise ConfigError(f"{where or cls.__name__} must be a table of keys, not {data!r}")
-    hints = typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
     names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
     values = {}
     for key, value in data.items():
@@ -247,13 +335,23 @@ def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
         if not dataclasses.is_dataclass(child):
             raise ConfigError(f"'{full}': '{head}' is a value, it has no keys of its own")
         return dataclasses.replace(config, **{head: _replace(child, rest, value, full)})
-    hint = typing.get_type_hints(type(config))[head]
+    hint = typing.get_type_hints(type(config), include_extras=True)[head]
     return dataclasses.replace(config, **{head: _coerce(hint, value, full)})
 
 
 def _coerce(hint: Any, value: Any, path: str) -> Any:
     """``value`` as the annotated type: the few that configurations use, and nothing else."""
     origin = typing.get_origin(hint)
+    if hint == Range:
+        low, high = _coerce(typing.get_args(hint)[0], value, path)
+        if low > high:
+            raise ConfigError(f"'{path}' must be [low, high] with low <= high, not {value!r}")
+        return low, high
+    if origin is Literal:
+        if value not in typing.get_args(hint):
+            allowed = ", ".join(typing.get_args(hint))
+            raise ConfigError(f"'{path}' must be one of {allowed}, not {value!r}")
+        return value
     if dataclasses.is_dataclass(hint):
         return from_dict(typing.cast(type, hint), value, path)
     if origin in (typing.Union, types.UnionType):
@@ -269,10 +367,7 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
             return tuple(_coerce(args[0], v, path) for v in value)
         if len(value) != len(args):
             raise ConfigError(f"'{path}' must have {len(args)} values, not {len(value)}")
-        result = tuple(_coerce(a, v, path) for a, v in zip(args, value, strict=True))
-        if hint == Range and result[0] > result[1]:
-            raise ConfigError(f"'{path}' must be [low, high] with low <= high, not {value!r}")
-        return result
+        return tuple(_coerce(a, v, path) for a, v in zip(args, value, strict=True))
     if hint is bool and isinstance(value, bool):
         return value
     if hint is int and isinstance(value, int) and not isinstance(value, bool):

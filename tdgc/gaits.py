@@ -100,11 +100,13 @@ class PhaseClock:
     Attributes:
         clock: (M,) cycle fraction.
         phases: (M, 4) warped foot phases of the last ``advance``/``update``.
+        contact: (M, 4) desired contact C at these phases.
     """
 
     def __init__(self, num_robots: int) -> None:
         self.clock = np.zeros(num_robots)
         self.phases = np.zeros((num_robots, 4))
+        self.contact = desired_contact(self.phases)
 
     def reset(self, index: ArrayLike, clock: ArrayLike = 0.0) -> None:
         """Set the clock of the robots in ``index``; call ``update`` to refresh the phases."""
@@ -124,6 +126,7 @@ class PhaseClock:
     def update(self, embedding: NDArray[np.floating], duration: NDArray[np.floating]) -> None:
         """Recompute the foot phases after a change of gait or duty factor."""
         self.phases = foot_phases(self.clock, embedding, duration)
+        self.contact = desired_contact(self.phases)
 
     def signal(self) -> NDArray[np.float64]:
         """phi_t: sin(2 pi phase) of each foot, (M, 4), as the low level sees it."""

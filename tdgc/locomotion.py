@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.commands import INDEX, NUM_COMMANDS, OBSERVATION_SCALE, default_command, gait_index
+from tdgc.commands import INDEX, NUM_COMMANDS, default_command, gait_index, observed_command
 from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
 from tdgc.gaits import GAITS, PhaseClock
 from tdgc.robot import (
@@ -140,13 +140,22 @@ class Locomotion:
         self.clock.reset(index, clock)
 
     def randomise(
-        self, index: NDArray[np.integer], config: RandomisationConfig, rng: np.random.Generator
+        self,
+        index: NDArray[np.integer],
+        config: RandomisationConfig,
+        rng: np.random.Generator,
+        width: Array | float = 1.0,
     ) -> None:
-        """Draw the physical parameters of the robots ``index`` about their nominal values."""
+        """Draw the physical parameters of the robots ``index`` about their nominal values.
+
+        ``width`` (n,) scales each robot's ranges, as ``config.scale`` does all.
+        """
         n = len(index)
+        scale = np.broadcast_to(config.scale * np.asarray(width), n)
 
         def draw(bounds: Range, nominal: float, shape: tuple[int, ...] = (n,)) -> Array:
-            return nominal + config.scale * (rng.uniform(*bounds, size=shape) - nominal)
+            drawn = rng.uniform(*bounds, size=shape) - nominal
+            return nominal + (scale * drawn.T).T
 
         self.friction[index] = draw(config.friction, self.physics.friction)
         self.payload[index] = draw(config.payload, 0.0)
@@ -159,8 +168,13 @@ class Locomotion:
         """One control step: clip, scale, delay, PD control in Bullet, clock (Sec. IV-A).
 
         Args:
-            actions: (M, 12), finite.
+            actions: (M, 12).
+
+        Raises:
+            ValueError: a value that is not finite.
         """
+        if not np.isfinite(actions).all():
+            raise ValueError("an action must be finite; it has NaN or infinite values")
         clipped = np.clip(actions, -self.robot.action_limit, self.robot.action_limit)
         self.actions = np.stack([clipped, self.actions[0]])
         self.targets = np.concatenate([joint_targets(self.robot, clipped)[None], self.targets[:-1]])
@@ -200,7 +214,7 @@ class Locomotion:
             SPEED_SCALE * speed,
             self.actions[0],
             self.actions[1],
-            OBSERVATION_SCALE * self.command,
+            observed_command(self.command),
             self.clock.signal(),
             gait_index(self.command)[:, None] / (len(GAITS) - 1),
         ]

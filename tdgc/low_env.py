@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tdgc import rewards
 from tdgc.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.config import LowLevelConfig
-from tdgc.gaits import GAITS, desired_contact, gait_embedding, swing_profile
+from tdgc.gaits import GAITS, gait_embedding, swing_profile
 from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
 from tdgc.robot import HIPS_XY, NUM_JOINTS, Array, wrap_angle
 from tdgc.terrain import MAX_LEVEL, TILE_SIZE, TileField, draw_start_goal, make_tile, tile_rng
@@ -63,6 +63,7 @@ _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap
 # Command curriculum: a gait's velocity range grows when it tracks well over an evaluation batch.
 _GROWTH = 0.05
 _GROW_LIN, _GROW_YAW = 0.7, 0.6  # of the terms' maxima (Walk These Ways: 0.8 and 0.7)
+_GROW_CONTACT = 0.8  # share of feet in contact as desired: speed comes after gait
 
 
 def is_fallen(world: World) -> NDArray[np.bool_]:
@@ -111,6 +112,7 @@ class LowLevelTask:
             self._draw_tiles()
         self.locomotion = self._build_locomotion()
         self.elapsed = np.zeros(m, dtype=np.int64)
+        self._began = np.zeros(m, dtype=np.int64)  # elapsed at the start of the episode
         self._next_push = np.zeros(m, dtype=np.int64)
         self._crossing = np.zeros(m, dtype=bool)
         self._speed = np.zeros(m)
@@ -119,7 +121,7 @@ class LowLevelTask:
         self._reached = np.zeros(m, dtype=bool)
         self._was_contact = np.zeros((m, 4), dtype=bool)
         self._origin = np.zeros((m, 2))
-        self._gait_scores = np.zeros((len(GAITS), 3))
+        self._gait_scores = np.zeros((len(GAITS), 4))
         self.stats: dict[str, float] = {}
         self._ground = self._measure_ground()
         layout = self.locomotion.layout
@@ -161,16 +163,12 @@ class LowLevelTask:
             self._crossing[index] = False
         else:
             self._origin[index] = self.field.origin(index, np.zeros_like(index))
-            xy, yaw, goal = np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2))
-            for k, i in enumerate(index):
-                start, goal[k] = draw_start_goal(rng)
-                xy[k] = start[:2]
-                yaw[k] = start[2]
-            xy += self._origin[index]
+            start, goal = draw_start_goal(rng, (n,))
+            xy, yaw = start[:, :2] + self._origin[index], start[:, 2]
             self._waypoint[index] = goal + self._origin[index]
             self._crossing[index] = rng.uniform(size=n) < _CROSSING_SHARE
         self._reached[index] = False
-        self.elapsed[index] = 0
+        self.elapsed[index] = self._began[index] = 0
         self._was_contact[index] = False
         if self.training:
             self.locomotion.randomise(index, self.config.randomisation, rng)
@@ -180,7 +178,9 @@ class LowLevelTask:
             # Face so that the first command needs no turn on the spot.
             yaw = yaw + np.where(self._crossing[index], self._facing[index], 0.0)
         self.locomotion.place(index, xy, yaw, rng.uniform(size=n))
-        self._refresh()
+        self._ground = self._measure_ground()
+        if self.field is not None:
+            self._steer_crossings()
 
     def restart(self) -> None:
         """End every episode, redraw the terrain and build the world anew.
@@ -197,6 +197,7 @@ class LowLevelTask:
         self.reset(np.arange(self.num_robots))
         # Spread the ends of the coming episodes over time.
         self.elapsed[:] = self.rng.integers(0, self.horizon, self.num_robots)
+        self._began[:] = self.elapsed
         self._schedule_push(np.arange(self.num_robots))
 
     def step(
@@ -204,7 +205,7 @@ class LowLevelTask:
     ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """One control step of all robots: (M, 12) -> reward, terminated, truncated, (M,) each."""
         loco, c = self.locomotion, self.config
-        before = loco.world.state.qd
+        before = loco.world.state.qd.copy()
         loco.act(np.asarray(actions, dtype=np.float64))
         self.elapsed += 1
         self._ground = self._measure_ground()
@@ -242,7 +243,7 @@ class LowLevelTask:
                 10.0 * (base_height - self.config.robot.base_height)[:, None],
                 10.0 * foot_height,
                 state.foot_force > rewards.CONTACT_FORCE,
-                desired_contact(loco.clock.phases),
+                loco.clock.contact,
                 np.stack(dynamics, axis=1),
                 5.0 * np.clip(probes, -0.5, 0.5),
             ],
@@ -276,7 +277,7 @@ class LowLevelTask:
             state=loco.world.state,
             command=loco.command,
             phases=loco.clock.phases,
-            contact=desired_contact(loco.clock.phases),
+            contact=loco.clock.contact,
             swing=swing_profile(loco.clock.phases),
             base_height=base_height,
             foot_height=foot_height,
@@ -366,8 +367,8 @@ class LowLevelTask:
     ) -> None:
         """Move robots that end an episode between levels, as legged_gym does.
 
-        Up when the tile was crossed; down when less than half of it was; a robot that crosses the
-        last level starts over at a random one.
+        Up when the tile was crossed; down when less than half of it was, unless only a part of an
+        episode was given; a robot that crosses the last level starts over at a random one.
         """
         if self.field is None or not self.training:
             return
@@ -375,7 +376,7 @@ class LowLevelTask:
         crossed = done & self._crossing & self._reached
         local = self.locomotion.world.state.position[:, 0] - self._origin[:, 0]
         short = done & self._crossing & ~self._reached & (local < 0.5 * TILE_SIZE)
-        short &= failed | (self.elapsed >= self.horizon)
+        short &= failed | (self.elapsed - self._began >= self.horizon)
         self.level = np.where(crossed, self.level + 1, np.where(short, self.level - 1, self.level))
         solved = self.level > top
         self.level[solved] = self.rng.integers(0, top + 1, int(solved.sum()))
@@ -395,22 +396,24 @@ class LowLevelTask:
         add("reward", reward.sum())
         for name, value in terms.items():
             add(f"term/{name}", value.sum())
-        state, gait = loco.world.state, gait_index(loco.command)
-        lin = np.sum((state.heading_vel[:, :2] - loco.command[:, :2]) ** 2, axis=1)
-        yaw = (state.ang_vel[:, 2] - loco.command[:, INDEX["yaw_rate"]]) ** 2
-        wanted = desired_contact(loco.clock.phases) > 0.5
-        match = np.mean((state.foot_force > rewards.CONTACT_FORCE) == wanted, axis=1)
+        state = loco.world.state
+        wanted = loco.clock.contact > 0.5
+        nothing = np.zeros(self.num_robots)  # of a term that is switched off
+        samples = np.stack(
+            [
+                np.ones(self.num_robots),
+                np.sum((state.heading_vel[:, :2] - loco.command[:, :2]) ** 2, axis=1),
+                (state.ang_vel[:, 2] - loco.command[:, INDEX["yaw_rate"]]) ** 2,
+                np.mean((state.foot_force > rewards.CONTACT_FORCE) == wanted, axis=1),
+                terms.get("track_lin_vel", nothing),
+                terms.get("track_yaw_rate", nothing),
+            ]
+        )
+        by_gait = samples @ np.eye(len(GAITS))[gait_index(loco.command)]
         for g, name in enumerate(GAITS):
-            mine = gait == g
-            add(f"gait/{name}/steps", mine.sum())
-            add(f"gait/{name}/lin", lin[mine].sum())
-            add(f"gait/{name}/yaw", yaw[mine].sum())
-            add(f"gait/{name}/match", match[mine].sum())
-            self._gait_scores[g] += (
-                mine.sum(),
-                terms["track_lin_vel"][mine].sum(),
-                terms["track_yaw_rate"][mine].sum(),
-            )
+            for key, value in zip(("steps", "lin", "yaw", "match"), by_gait[:, g], strict=False):
+                add(f"gait/{name}/{key}", value)
+        self._gait_scores += by_gait[[0, 4, 5, 3]].T
         self._grow_commands()
         if self.field is not None:
             for col, family in enumerate(self.config.families):
@@ -423,9 +426,10 @@ class LowLevelTask:
         samples = 200 * self.num_robots / len(GAITS)  # about 4 s of every robot
         weights = self.config.rewards
         for g in np.flatnonzero(self._gait_scores[:, 0] >= samples):
-            count, lin, yaw = self._gait_scores[g]
+            count, lin, yaw, match = self._gait_scores[g]
             good = lin / count > _GROW_LIN * weights.track_lin_vel
             good &= yaw / count > _GROW_YAW * weights.track_yaw_rate
+            good &= match / count > _GROW_CONTACT
             if good and self.training:
                 self.command_share[g] = min(1.0, self.command_share[g] + _GROWTH)
             self._gait_scores[g] = 0.0

@@ -10,6 +10,7 @@ critic, ``NAME.json`` says what they mean::
                       "critic": [256, 128],
                       "lstm": null},                  hidden size of both LSTMs; null for "mlp"
      "observation": {"size": 95, "actor_size": 70},   [actor part | critic-only part]
+     "mirror": null,                                  or how left and right are exchanged, see Mirror
      "action": {"size": 12, "low": [...], "high": [...]},            null: unbounded
      "sha256": "...",                                 of NAME.safetensors
      "meta": {...}}                                   the caller's: configuration, seed, steps, ...
@@ -23,6 +24,7 @@ action), ``critic.*`` likewise (the last one gives the value), ``log_std``, and 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import math
@@ -40,7 +42,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
-from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import (
     FlattenExtractor,
@@ -80,8 +82,38 @@ class PolicyFileError(ValueError):
 # The trained side: an SB3 policy whose critic sees more than its actor
 
 
+@dataclass(frozen=True)
+class Mirror:
+    """How an observation and an action look in a left-right mirror.
+
+    ``sign * x[..., index]`` is x mirrored. The observation's part may be longer than the actor's,
+    whose entries then come first and stay among themselves.
+    """
+
+    obs_index: tuple[int, ...]
+    obs_sign: tuple[float, ...]
+    action_index: tuple[int, ...]
+    action_sign: tuple[float, ...]
+
+    def actor_part(self, size: int) -> Mirror:
+        """The same for the first ``size`` entries of the observation.
+
+        Raises:
+            ValueError: one of them comes from beyond.
+        """
+        if any(i >= size for i in self.obs_index[:size]):
+            raise ValueError("the mirror mixes the actor's part with the critic's")
+        return Mirror(
+            self.obs_index[:size], self.obs_sign[:size], self.action_index, self.action_sign
+        )
+
+
 class AsymmetricMlpExtractor(nn.Module):
-    """Two separate MLPs: the actor's on the first ``actor_dim`` features, the critic's on all."""
+    """Two separate MLPs: the actor's on the first ``actor_dim`` features, the critic's on all.
+
+    With a mirror the latents of an observation and of its mirror image stand side by side, twice
+    as wide, for ``MirroredHead`` to average.
+    """
 
     def __init__(
         self,
@@ -89,6 +121,7 @@ class AsymmetricMlpExtractor(nn.Module):
         critic_dim: int,
         net_arch: dict[str, list[int]],
         activation_fn: type[nn.Module],
+        mirror: Mirror | None = None,
     ) -> None:
         super().__init__()
         self.actor_dim = actor_dim
@@ -97,18 +130,52 @@ class AsymmetricMlpExtractor(nn.Module):
         self.value_net = nn.Sequential(*create_mlp(critic_dim, -1, critic, activation_fn))
         self.latent_dim_pi = actor[-1] if actor else actor_dim
         self.latent_dim_vf = critic[-1] if critic else critic_dim
+        self.mirrored = mirror is not None
+        if mirror is not None:
+            self.register_buffer("index", th.tensor(mirror.obs_index), persistent=False)
+            self.register_buffer("sign", th.tensor(mirror.obs_sign), persistent=False)
 
     def forward(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """(n, critic_dim) -> (n, latent_dim_pi), (n, latent_dim_vf)."""
+        """(n, critic_dim) -> latents for the two heads."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: th.Tensor) -> th.Tensor:
-        """(n, critic_dim) or (n, actor_dim) -> (n, latent_dim_pi)."""
-        return cast(th.Tensor, self.policy_net(features[..., : self.actor_dim]))
+        """(n, critic_dim) or (n, actor_dim) -> (n, latent_dim_pi), twice that with a mirror."""
+        return self._latent(self.policy_net, features[..., : self.actor_dim])
 
     def forward_critic(self, features: th.Tensor) -> th.Tensor:
-        """(n, critic_dim) -> (n, latent_dim_vf)."""
-        return cast(th.Tensor, self.value_net(features))
+        """(n, critic_dim) -> (n, latent_dim_vf), twice that with a mirror."""
+        return self._latent(self.value_net, features)
+
+    def _latent(self, net: nn.Module, x: th.Tensor) -> th.Tensor:
+        if not self.mirrored:
+            return cast(th.Tensor, net(x))
+        width = x.shape[-1]
+        index, sign = cast(th.Tensor, self.index), cast(th.Tensor, self.sign)
+        both = net(th.cat([x, x[..., index[:width]] * sign[:width]]))
+        return th.cat(both.chunk(2), dim=-1)
+
+
+class MirroredHead(nn.Module):
+    """Mean of a linear layer on a latent and, mirrored back, on its mirror image's latent.
+
+    So an action's mirror image is exactly the action for the mirrored observation, and a value is
+    the same in the mirror: half of what there is to learn.
+    """
+
+    def __init__(self, linear: nn.Linear, mirror: Mirror | None) -> None:
+        super().__init__()
+        self.linear = linear
+        index = range(linear.out_features) if mirror is None else mirror.action_index
+        sign = [1.0] * linear.out_features if mirror is None else mirror.action_sign
+        self.register_buffer("index", th.tensor(list(index)), persistent=False)
+        self.register_buffer("sign", th.tensor(sign), persistent=False)
+
+    def forward(self, latents: th.Tensor) -> th.Tensor:
+        """(n, 2 latent_dim) -> (n, outputs)."""
+        index, sign = cast(th.Tensor, self.index), cast(th.Tensor, self.sign)
+        seen, mirrored = (self.linear(x) for x in latents.chunk(2, dim=-1))
+        return cast(th.Tensor, 0.5 * (seen + mirrored[..., index] * sign))
 
 
 class AsymmetricActorCriticPolicy(ActorCriticPolicy):
@@ -118,6 +185,8 @@ class AsymmetricActorCriticPolicy(ActorCriticPolicy):
     actor sees the first ``actor_dim`` entries and nothing else. Everything that SB3's
     ``ActorCriticPolicy`` takes can be given too; ``net_arch`` and ``activation_fn`` have other
     defaults here.
+
+    With a ``mirror`` the policy is exactly left-right symmetric, and so is its value.
 
     Raises:
         ValueError: the observation is not a flat Box, or ``actor_dim`` does not fit it.
@@ -130,6 +199,7 @@ class AsymmetricActorCriticPolicy(ActorCriticPolicy):
         lr_schedule: Schedule,
         *,
         actor_dim: int,
+        mirror: Mirror | None = None,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ELU,
         **kwargs: Any,
@@ -139,7 +209,7 @@ class AsymmetricActorCriticPolicy(ActorCriticPolicy):
             raise ValueError(f"the observation space must be a flat Box, not {observation_space}")
         if not 0 < actor_dim <= shape[0]:
             raise ValueError(f"actor_dim must be in 1..{shape[0]}, not {actor_dim}")
-        self.actor_dim = actor_dim
+        self.actor_dim, self.mirror = actor_dim, mirror
         super().__init__(
             observation_space,
             action_space,
@@ -156,10 +226,29 @@ class AsymmetricActorCriticPolicy(ActorCriticPolicy):
             self.features_dim,
             arch if isinstance(arch, dict) else {"pi": arch, "vf": arch},
             self.activation_fn,
+            self.mirror,
         ).to(self.device)
 
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        if self.mirror is not None:  # the heads keep their parameters, so the optimiser has them
+            self.action_net = MirroredHead(cast(nn.Linear, self.action_net), self.mirror)
+            self.value_net = MirroredHead(self.value_net, None)  # type: ignore[assignment]
+
+    def symmetric_log_std(self) -> th.Tensor:
+        """log sigma of the actions, (action_dim,), the same on both sides with a mirror."""
+        log_std = cast(th.Tensor, self.log_std)
+        if self.mirror is None:
+            return log_std
+        return 0.5 * (log_std + log_std[list(self.mirror.action_index)])
+
+    def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
+        distribution = cast(DiagGaussianDistribution, self.action_dist)
+        return distribution.proba_distribution(self.action_net(latent_pi), self.symmetric_log_std())
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "actor_dim": self.actor_dim}
+        own = {"actor_dim": self.actor_dim, "mirror": self.mirror}
+        return {**super()._get_constructor_parameters(), **own}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -180,6 +269,7 @@ class Header:
     low: tuple[float, ...]
     high: tuple[float, ...]
     meta: dict[str, Any]
+    mirror: Mirror | None = None  # of the actor's part
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Name and shape of every tensor, in the order they are written."""
@@ -226,6 +316,7 @@ class Header:
                 "low": [x if math.isfinite(x) else None for x in self.low],
                 "high": [x if math.isfinite(x) else None for x in self.high],
             },
+            "mirror": None if self.mirror is None else dataclasses.asdict(self.mirror),
             "sha256": sha256,
             "meta": self.meta,
         }
@@ -251,8 +342,8 @@ class Header:
         version = table.get("version")
         if not isinstance(version, int) or isinstance(version, bool) or version != VERSION:
             raise PolicyFileError(f"format version {version!r:.40}; this code reads {VERSION}")
-        keys = ("format", "version", "kind", "architecture", "observation", "action", "sha256",
-                "meta")  # fmt: skip
+        keys = ("format", "version", "kind", "architecture", "observation", "action", "mirror",
+                "sha256", "meta")  # fmt: skip
         _check_keys(table, keys, "the file")
         kind, sha256, meta = table["kind"], table["sha256"], table["meta"]
         if kind not in KINDS:
@@ -295,6 +386,7 @@ class Header:
             low=low,
             high=high,
             meta=meta,
+            mirror=_mirror(table["mirror"], actor_dim, action_dim),
         )
         if header.nbytes() > _MAX_WEIGHT_BYTES:
             raise PolicyFileError(f"{header.nbytes()} bytes of weights, too large to be a policy")
@@ -326,6 +418,26 @@ def _sizes(value: Any, name: str) -> tuple[int, ...]:
     if not isinstance(value, list) or len(value) > _MAX_LAYERS:
         raise PolicyFileError(f"{name} must be a list of at most {_MAX_LAYERS} layer sizes")
     return tuple(_size(v, f"{name}[{i}]") for i, v in enumerate(value))
+
+
+def _mirror(value: Any, obs: int, actions: int) -> Mirror | None:
+    if value is None:
+        return None
+    parts = tuple(f.name for f in dataclasses.fields(Mirror))
+    _check_keys(value, parts, "'mirror'")
+    for part, size in zip(parts, (obs, obs, actions, actions), strict=True):
+        entries = value[part]
+        if not isinstance(entries, list) or len(entries) != size:
+            raise PolicyFileError(f"'{part}' of 'mirror' must be a list of {size} numbers")
+        if part.endswith("index"):
+            if any(type(i) is not int for i in entries) or sorted(entries) != list(range(size)):
+                raise PolicyFileError(f"'{part}' of 'mirror' must hold 0 to {size - 1}, each once")
+        elif any(sign not in (1, -1) for sign in entries):
+            raise PolicyFileError(f"'{part}' of 'mirror' must hold 1 and -1 only")
+    index, sign, action_index, action_sign = (value[part] for part in parts)
+    return Mirror(
+        tuple(index), tuple(map(float, sign)), tuple(action_index), tuple(map(float, action_sign))
+    )
 
 
 def _bounds(value: Any, count: int, unbounded: float, name: str) -> tuple[float, ...]:
@@ -405,7 +517,8 @@ def load_into(path: str | os.PathLike[str], policy: ActorCriticPolicy) -> dict[s
     """
     header, tensors = _read(path)
     mine = _describe(policy, header.meta)
-    for name in ("kind", "activation", "lstm", "actor", "critic", "obs_dim", "actor_dim"):
+    names = ("kind", "activation", "lstm", "actor", "critic", "obs_dim", "actor_dim", "mirror")
+    for name in names:
         if getattr(mine, name) != getattr(header, name):
             raise PolicyFileError(
                 f"{path}: {name} is {getattr(header, name)}, this policy's {getattr(mine, name)}"
@@ -530,6 +643,8 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
 
     box = cast(spaces.Box, action_space)
     obs_dim = cast(tuple[int, ...], obs_space.shape)[0]
+    actor_dim = getattr(policy, "actor_dim", obs_dim)
+    mirror: Mirror | None = getattr(policy, "mirror", None)
     return Header(
         kind="mlp" if lstm is None else "lstm",
         activation=activations[0],
@@ -537,10 +652,11 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
         critic=hidden("critic"),
         lstm=lstm,
         obs_dim=obs_dim,
-        actor_dim=getattr(policy, "actor_dim", obs_dim),
+        actor_dim=actor_dim,
         low=tuple(float(x) for x in box.low),
         high=tuple(float(x) for x in box.high),
         meta=meta,
+        mirror=mirror if mirror is None else mirror.actor_part(actor_dim),
     )
 
 
@@ -556,7 +672,8 @@ def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
             lstm = getattr(policy, f"lstm_{net}")
             for tensor in _LSTM_TENSORS:
                 tensors[f"{net}_lstm.{tensor}"] = getattr(lstm, f"{tensor}_l0")
-        layers = [m for m in (*body, output) if isinstance(m, nn.Linear)]
+        head = output.linear if isinstance(output, MirroredHead) else output
+        layers = [m for m in (*body, head) if isinstance(m, nn.Linear)]
         for i, layer in enumerate(layers):
             tensors[f"{net}.{i}.weight"] = layer.weight
             tensors[f"{net}.{i}.bias"] = layer.bias
@@ -596,7 +713,13 @@ class Policy:
             for i in range(len(header.actor) + 1)
         ]
         self._lstm = [tensors[f"actor_lstm.{t}"] for t in _LSTM_TENSORS] if header.lstm else []
-        self._std: Array = np.exp(tensors["log_std"].numpy())
+        log_std = tensors["log_std"].numpy()
+        if header.mirror is not None:
+            log_std = 0.5 * (log_std + log_std[list(header.mirror.action_index)])
+        self._std: Array = np.exp(log_std)
+        self._mirror = header.mirror and tuple(
+            th.tensor(part) for part in dataclasses.astuple(header.mirror)
+        )
         self.seed(0)
 
     def seed(self, seed: int | None) -> None:
@@ -640,9 +763,16 @@ class Policy:
                 h, c = self._previous(state, episode_start, len(batch), self._hidden)
                 h, c = th.lstm_cell(latent, (h, c), *self._lstm)
                 latent, state = h, (h.numpy()[None], c.numpy()[None])
+            if self._mirror is not None:
+                obs_index, obs_sign, action_index, action_sign = self._mirror
+                latent = th.cat([latent, latent[:, obs_index] * obs_sign])
             for weight, bias in self._layers[:-1]:
                 latent = self._activation(F.linear(latent, weight, bias))
-            actions: Array = F.linear(latent, *self._layers[-1]).numpy()
+            output = F.linear(latent, *self._layers[-1])
+            if self._mirror is not None:
+                seen, mirrored = output.chunk(2)
+                output = 0.5 * (seen + mirrored[:, action_index] * action_sign)
+            actions: Array = output.numpy()
         if not deterministic:
             noise = self._rng.standard_normal(actions.shape, dtype=np.float32)
             actions = actions + self._std * noise

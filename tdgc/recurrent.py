@@ -25,7 +25,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         lstm_states: tuple[th.Tensor, th.Tensor],
         episode_starts: th.Tensor,
         lstm: nn.LSTM,
-    ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
+    ) -> tuple[th.Tensor, th.Tensor]:  # as sb3-contrib has it; the second is a pair of them
         """One pass of ``lstm`` over ``n_seq`` padded sequences of equal length.
 
         Args:
@@ -36,7 +36,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
             lstm: the actor's or the critic's.
 
         Returns:
-            Outputs (n_seq * length, hidden) and the states after the last step.
+            Outputs (n_seq * length, hidden) and the pair of states after the last step.
         """
         n_seq = lstm_states[0].shape[1]
         starts = episode_starts.reshape(n_seq, -1)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdgc.commands import INDEX
-from tdgc.config import LowRewardConfig
+from tdgc.config import HighRewardConfig, LowRewardConfig
 from tdgc.robot import FOOT_RADIUS, HIPS_XY, JOINT_LIMITS, Array, RobotState
 
 CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact
@@ -263,3 +263,130 @@ def total(terms: Mapping[str, Array], weights: LowRewardConfig, dt: float) -> Ar
         else:
             negative = negative + value
     return np.asarray(dt * positive * np.exp(negative))
+
+
+# ---------------------------------------------------------------------------- high level
+
+
+@dataclass
+class HighStep:
+    """All that the high-level terms look at, one decision of M robots (Sec. IV-B).
+
+    Attributes:
+        distance: (M,) m to the goal, d_t.
+        heading_error: (M,) rad, psi* - psi.
+        time_share: (M,) t / T_max.
+        lin_vel, ang_vel: (M, 3) of the base, m/s and rad/s; joint_speed: (M, 12) rad/s.
+        base_height: (M,) m above ground; standing_height: m, z*.
+        actions: (2, M, 13), this action and the one before, clipped and normalised.
+        commands: (3, M, 15) of this decision and the two before, each as a share of its range.
+        contact_forces: (M, 5) N: the trunk, and each leg above the foot.
+        config: the constants.
+    """
+
+    distance: Array
+    heading_error: Array
+    time_share: Array
+    lin_vel: Array
+    ang_vel: Array
+    joint_speed: Array
+    base_height: Array
+    standing_height: float
+    actions: Array
+    commands: Array
+    contact_forces: Array
+    config: HighRewardConfig
+
+    @property
+    def inside(self) -> Array:
+        """1[d_t < d_0], (M,)."""
+        return (self.distance < self.config.goal_radius).astype(np.float64)
+
+
+def goal_distance(s: HighStep) -> Array:
+    """r_goal_dist = p + a (1 - e^{-b p}), p = clip(1 - d_t / R_map, 0, 1)."""
+    p = np.clip(1.0 - s.distance / s.config.map_radius, 0.0, 1.0)
+    return p + s.config.curve_gain * (1.0 - np.exp(-s.config.curve_rate * p))
+
+
+def face(s: HighStep) -> Array:
+    """r_face = cos(psi* - psi)."""
+    return np.cos(s.heading_error)
+
+
+def arrive(s: HighStep) -> Array:
+    """r_arrive = 1[d_t < d_0] (b_0 + b_1 alpha), alpha = clip(1 - t / T_max, 0, 1)."""
+    alpha = np.clip(1.0 - s.time_share, 0.0, 1.0)
+    return s.inside * (s.config.arrive_base + s.config.arrive_speed * alpha)
+
+
+def stable(s: HighStep) -> Array:
+    """r_stable = 1[d_t < d_0] exp(-eta_t) exp(-(z - z*)^2 / sigma_z)."""
+    eta = (
+        np.linalg.norm(s.lin_vel, axis=1)
+        + np.linalg.norm(s.ang_vel, axis=1)
+        + s.config.joint_speed_weight * np.linalg.norm(s.joint_speed, axis=1)
+    )
+    height = (s.base_height - s.standing_height) ** 2 / s.config.height_scale
+    return s.inside * np.exp(-eta) * np.exp(-height)
+
+
+def high_action_rate(s: HighStep) -> Array:
+    """r_action_rate = sum_j (a_t - a_{t-1})^2."""
+    return _square_sum(s.actions[0] - s.actions[1])
+
+
+def command_rate(s: HighStep) -> Array:
+    """r_cmd_sm1: mean squared first difference of the commands."""
+    return _square_sum(s.commands[0] - s.commands[1]) / s.commands.shape[-1]
+
+
+def command_acceleration(s: HighStep) -> Array:
+    """r_cmd_sm2: mean squared second difference of the commands."""
+    second = s.commands[0] - 2.0 * s.commands[1] + s.commands[2]
+    return _square_sum(second) / s.commands.shape[-1]
+
+
+def contact_force(s: HighStep) -> Array:
+    """r_col = sum_j max(0, |F_j| - F_th), of the trunk and the legs above the feet."""
+    return np.sum(np.maximum(s.contact_forces - s.config.force_threshold, 0.0), axis=1)
+
+
+def laziness(s: HighStep) -> Array:
+    """r_lazy = 1[d_t > d_0] 1[|v| < v_th]."""
+    slow = np.linalg.norm(s.lin_vel, axis=1) < s.config.lazy_speed
+    return (1.0 - s.inside) * slow
+
+
+def alive(s: HighStep) -> Array:
+    """r_alive = 1."""
+    return np.ones_like(s.distance)
+
+
+#: Terms of the high level by the name of their weight in ``HighRewardConfig``.
+HIGH_TERMS: dict[str, Callable[[HighStep], Array]] = {
+    "goal_distance": goal_distance,
+    "face": face,
+    "arrive": arrive,
+    "stable": stable,
+    "action_rate": high_action_rate,
+    "command_rate": command_rate,
+    "command_acceleration": command_acceleration,
+    "contact_force": contact_force,
+    "laziness": laziness,
+    "alive": alive,
+}
+if not set(HIGH_TERMS) <= {f.name for f in dataclasses.fields(HighRewardConfig)}:
+    raise TypeError("HIGH_TERMS names a term without a weight in HighRewardConfig")
+
+
+def high_terms(step: HighStep, dt: float) -> dict[str, Array]:
+    """Every enabled term times its effective weight w_i dt (step-time scaling), (M,) each.
+
+    The high level's reward is their plain sum.
+    """
+    return {
+        name: weight * dt * term(step)
+        for name, term in HIGH_TERMS.items()
+        if (weight := getattr(step.config, name)) != 0.0
+    }

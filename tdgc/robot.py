@@ -52,11 +52,9 @@ def urdf_path(config: RobotConfig) -> Path:
 
 def nominal_pose(config: RobotConfig) -> Array:
     """q0 of the paper, (12,) rad."""
-    pose = [
-        (config.nominal_hip * side, config.nominal_thigh[0 if front > 0 else 1], config.nominal_calf)
-        for side, front in zip(_SIDE, _FRONT, strict=True)
-    ]
-    return np.array(pose).ravel()
+    front, rear = config.nominal_thigh
+    thigh = np.where(_FRONT > 0, front, rear)
+    return np.stack([config.nominal_hip * _SIDE, thigh, np.full(4, config.nominal_calf)], 1).ravel()
 
 
 def joint_targets(config: RobotConfig, actions: Array) -> Array:

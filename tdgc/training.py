@@ -1,4 +1,4 @@
-"""What both trainers share: the run folder, checkpoints, logs, mirrored samples, interruption.
+"""What both trainers share: the run folder, checkpoints, logs, interruption, the loop.
 
 A run folder holds ``config.json``, ``log.jsonl`` (a row every ``log_steps``), TensorBoard's event
 files, ``policy.safetensors`` with ``policy.json`` (the last policy, ready to be used) and
@@ -7,6 +7,7 @@ files, ``policy.safetensors`` with ``policy.json`` (the last policy, ready to be
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import os
@@ -15,23 +16,22 @@ import shutil
 import signal
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import safetensors.torch
 import torch as th
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from tqdm import tqdm
 
 from tdgc import __version__, policies
+from tdgc.config import Config, ConfigError, from_dict, to_dict, with_overrides
 from tdgc.vec import TaskVecEnv
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
@@ -39,38 +39,6 @@ _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
 
 class CheckpointError(ValueError):
     """A checkpoint or run folder that cannot be used; the message is one line."""
-
-
-class MirroredRolloutBuffer(RolloutBuffer):
-    """A rollout buffer whose minibatches also hold their left-right mirror images.
-
-    A quadruped is symmetric, so a mirrored sample is as good as a second robot's. Its advantage,
-    return and old log-probability are the original's; where the policy is not yet symmetric,
-    PPO's clipping bounds the difference.
-
-    Args:
-        observation_mirror, action_mirror: (index, sign) with which ``sign * x[:, index]`` is x
-            seen in a mirror.
-    """
-
-    def __init__(
-        self,
-        *args: Any,
-        observation_mirror: tuple[NDArray[np.int64], NDArray[np.float32]],
-        action_mirror: tuple[NDArray[np.int64], NDArray[np.float32]],
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*args, **kwargs)
-        self._mirrors = observation_mirror, action_mirror
-
-    def _get_samples(self, batch_inds: NDArray[np.int64], env: Any = None) -> RolloutBufferSamples:
-        samples = super()._get_samples(batch_inds, env)
-        (obs_index, obs_sign), (act_index, act_sign) = self._mirrors
-        seen = samples.observations[:, obs_index] * th.from_numpy(obs_sign)
-        done = samples.actions[:, act_index] * th.from_numpy(act_sign)
-        both = [th.cat([samples.observations, seen]), th.cat([samples.actions, done])]
-        rest = [th.cat([x, x]) for x in samples[2:]]
-        return RolloutBufferSamples(*both, *rest)
 
 
 # ---------------------------------------------------------------------------- checkpoints
@@ -228,6 +196,7 @@ class RunCallback(BaseCallback):
         meta: goes into the policy's file: configuration, seed.
         summarise: (sums of all workers) -> values to log.
         interruption: when to stop.
+        log_steps, checkpoint_steps: control steps between log rows and between checkpoints.
         seconds_before: wall time of the run so far.
     """
 
@@ -239,7 +208,7 @@ class RunCallback(BaseCallback):
         summarise: Callable[[dict[str, float]], dict[str, float]],
         interruption: Interruption,
         log_steps: int,
-        checkpoint_seconds: float,
+        checkpoint_steps: int,
         total_steps: int,
         seconds_before: float = 0.0,
         phase: int = 0,
@@ -247,11 +216,11 @@ class RunCallback(BaseCallback):
         super().__init__()
         self.run, self.env, self.meta = run, env, meta
         self.summarise, self.interruption = summarise, interruption
-        self.log_steps, self.checkpoint_seconds = log_steps, checkpoint_seconds
+        self.log_steps, self.checkpoint_steps = log_steps, checkpoint_steps
         self.total_steps = total_steps
         self.phase = phase
         self._started = time.monotonic() - seconds_before
-        self._saved = time.monotonic()
+        self._saved_at = 0
         self._logged_at = (0, 0.0)
         self._bar: Any = None
 
@@ -261,6 +230,7 @@ class RunCallback(BaseCallback):
         return time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
+        self._saved_at = self.num_timesteps
         self._logged_at = (self.num_timesteps, self.seconds)
         self._bar = tqdm(
             total=self.total_steps,
@@ -272,8 +242,9 @@ class RunCallback(BaseCallback):
         )
 
     def _on_rollout_start(self) -> None:
-        # Between an update and the next rollout the learner's state is whole.
-        if time.monotonic() - self._saved > self.checkpoint_seconds:
+        # Between an update and the next rollout the learner's state is whole. Steps, not seconds:
+        # a checkpoint begins new episodes, so where it falls must follow from the seed alone.
+        if self.num_timesteps - self._saved_at >= self.checkpoint_steps:
             self.checkpoint()
 
     def _on_step(self) -> bool:
@@ -292,7 +263,7 @@ class RunCallback(BaseCallback):
         meta = {**self.meta, "steps": self.num_timesteps, "seconds": round(self.seconds)}
         policies.save(self.run / "policy", self.model.policy, meta)
         restart(self.model, self.env)
-        self._saved = time.monotonic()
+        self._saved_at = self.num_timesteps
 
     def _log(self) -> None:
         sums: dict[str, float] = {}
@@ -358,3 +329,121 @@ def tensorboard_logger(folder: Path) -> Logger:
     from stable_baselines3.common.logger import TensorBoardOutputFormat
 
     return Logger(str(folder), [TensorBoardOutputFormat(str(folder))])
+
+
+# ---------------------------------------------------------------------------- the scripts
+
+
+class TrainConfig(Protocol):
+    """What the configurations of both trainers have in common."""
+
+    seed: int
+    n_envs: int
+    workers: int
+    steps: int
+    log_steps: int
+    checkpoint_steps: int
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of a run with its own environment.
+
+    Attributes:
+        build: makes the learner and its workers.
+        until: steps of the run at which the phase ends.
+    """
+
+    build: Callable[[], tuple[Any, TaskVecEnv]]
+    until: int
+
+
+def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
+    """The flags of both trainers; ``out`` is the default run folder."""
+    parser.add_argument("--seed", type=int, help="of everything random (42)")
+    parser.add_argument("--n-envs", type=int, help="robots altogether")
+    parser.add_argument("--workers", type=int, help="processes that simulate")
+    parser.add_argument("--steps", type=int, help="steps altogether")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds")
+    parser.add_argument("--device", default="cpu", help="where the learner runs (cpu)")
+    parser.add_argument("--out", type=Path, default=Path(out), help=f"run folder ({out})")
+    parser.add_argument("--resume", action="store_true", help="go on with the run in --out")
+    parser.add_argument("--init", type=Path, help="start from this policy instead of anew")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
+        help="change the configuration, e.g. ppo.n_steps=48",
+    )  # fmt: skip
+
+
+def configure(config: Config, args: argparse.Namespace) -> Config:
+    """Configuration of the run: the folder's when resuming, else ``config``, then the flags.
+
+    Raises:
+        ConfigError: nothing to resume, a folder in use, or an assignment that cannot be used.
+    """
+    stored = args.out / "config.json"
+    if args.resume:
+        if not stored.is_file():
+            raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
+        config = from_dict(type(config), json.loads(stored.read_text(encoding="utf-8")))
+    elif stored.exists():
+        raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
+    flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
+    given = [f"{k}={v}" for k, v in flags.items() if v is not None]
+    return with_overrides(config, [*given, *args.assignments])
+
+
+def run(
+    args: argparse.Namespace,
+    config: TrainConfig,
+    phases: Sequence[Phase],
+    meta: dict[str, Any],
+    summarise: Callable[[dict[str, float]], dict[str, float]],
+) -> bool:
+    """Train through the phases, or go on with them; False when interrupted.
+
+    Args:
+        args: the flags of ``add_arguments``.
+        config: of the whole run; written to the run folder.
+        phases: in order.
+        meta: goes into the policy's file.
+        summarise: sums of all workers -> values to log.
+
+    Raises:
+        CheckpointError: nothing to resume that can be read.
+        ValueError: a policy of ``--init`` that does not fit.
+    """
+    carried = newest_checkpoint(args.out, tqdm.write) if args.resume else None
+    if args.init is not None:
+        policies.load(args.init)  # before anything is written
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / "config.json").write_text(json.dumps(to_dict(config), indent=2), encoding="utf-8")
+    interruption = Interruption(args.time_limit)
+    seconds = float(carried[1]["seconds"]) if carried else 0.0
+    for number, phase in enumerate(phases):
+        if carried is not None and int(carried[1]["num_timesteps"]) >= phase.until:
+            continue
+        model, env = phase.build()
+        try:
+            model.set_logger(tensorboard_logger(args.out / "tensorboard"))
+            callback = RunCallback(
+                args.out, env, meta, summarise, interruption, config.log_steps,
+                config.checkpoint_steps, config.steps, seconds, number,
+            )  # fmt: skip
+            if carried is not None:
+                load_learner(model, *carried)
+                if carried[1]["phase"] == number:
+                    env.load_state_dicts(carried[1]["workers"])
+            elif args.init is not None:
+                policies.load_into(args.init, model.policy)
+            restart(model, env)
+            finished = learn(model, callback, phase.until)
+            callback.checkpoint()
+            carried = newest_checkpoint(args.out, tqdm.write)
+            seconds = callback.seconds
+        finally:
+            env.close()
+        if not finished:
+            tqdm.write(f"stopped by {interruption.reason}; --resume --out {args.out} goes on")
+            return False
+    return True

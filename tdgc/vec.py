@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing as mp
+import os
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
 from typing import Any, Protocol
@@ -137,6 +138,26 @@ def _work(
             task.close()
 
 
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Processes started within get one thread a linear algebra call.
+
+    Workers share the cores already, and threads that wait for each other on a busy core make a
+    matrix product of this size forty times slower.
+    """
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
 class TaskVecEnv(VecEnv):
     """``num_envs`` robots of a task, spread over ``workers`` processes.
 
@@ -181,28 +202,48 @@ class TaskVecEnv(VecEnv):
                 daemon=True,
                 name=f"tdgc-worker-{k}",
             )
-            process.start()
+            with one_blas_thread():
+                process.start()
             theirs.close()
             self._pipes.append(ours)
             self._processes.append(process)
-        for k in range(workers):
-            self._receive(k)
+        try:
+            for k in range(workers):
+                self._receive(k)
+        except WorkerError:
+            self.close()
+            raise
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
+
+    def _death(self, worker: int) -> WorkerError:
+        process = self._processes[worker]
+        process.join(timeout=5.0)  # its pipe closes a moment before it ends
+        return WorkerError(f"worker {worker} died (exit code {process.exitcode})")
+
+    def _send(self, worker: int, word: str, argument: Any = None) -> None:
+        try:
+            self._pipes[worker].send((word, argument))
+        except OSError as error:
+            raise self._death(worker) from error
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process numbers of the workers."""
+        return [process.pid for process in self._processes if process.pid is not None]
 
     def _receive(self, worker: int) -> Any:
         try:
             answer = self._pipes[worker].recv()
-        except (EOFError, ConnectionResetError) as error:
-            code = self._processes[worker].exitcode
-            raise WorkerError(f"worker {worker} died (exit code {code})") from error
+        except (EOFError, OSError) as error:
+            raise self._death(worker) from error
         if isinstance(answer, WorkerError):
             raise WorkerError(f"worker {worker} failed:\n{answer}")
         return answer
 
     def _ask(self, word: str, arguments: Sequence[Any] | None = None) -> list[Any]:
-        for k, pipe in enumerate(self._pipes):
-            pipe.send((word, None if arguments is None else arguments[k]))
+        for k in range(len(self._pipes)):
+            self._send(k, word, None if arguments is None else arguments[k])
         return [self._receive(k) for k in range(len(self._pipes))]
 
     def reset(self) -> NDArray[np.float32]:
@@ -214,8 +255,8 @@ class TaskVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
         self._views["actions"][:] = actions
-        for pipe in self._pipes:
-            pipe.send(("step", None))
+        for k in range(len(self._pipes)):
+            self._send(k, "step")
 
     def step_wait(self) -> Any:
         for k in range(len(self._pipes)):

@@ -111,6 +111,7 @@ class World:
         self._trunk_inertia = np.array(
             self._client_of[0].getDynamicsInfo(self._bodies[0], -1)[2]
         )
+        self._active = np.arange(num_robots)
 
     def _make_ground(self, client: _Client, count: int) -> None:
         if self.field is None:
@@ -158,14 +159,18 @@ class World:
             )
         )
 
-    def upload_terrain(self) -> None:
+    def upload_terrain(self, index: ArrayLike | None = None) -> None:
         """Bring the field's heights, redrawn in place, into Bullet.
+
+        With ``index`` only where those robots' tiles changed. About 1 us a sample of every client
+        concerned, so it is for the ends of episodes, not for every step.
 
         Raises:
             ValueError: heights outside the range that the field was made for.
         """
         assert self.field is not None, "a plane has no heights"
-        for client in self._clients:
+        rows = range(self.num_robots) if index is None else np.asarray(index)
+        for client in dict.fromkeys(self._client_of[i] for i in rows):
             self._upload(client, self.field.heights[client.samples], client.shape)
 
     def _load_robot(self, client: _Client, place: int) -> int:
@@ -248,6 +253,12 @@ class World:
             linear, angular = client.getBaseVelocity(body)
             client.resetBaseVelocity(body, np.add(linear, velocity[k]), angular)
 
+    def retire(self, index: ArrayLike) -> None:
+        """Take the robots ``index`` out for good; their rows of ``state`` stay as they are."""
+        for i in np.asarray(index):
+            self._client_of[i].removeBody(self._bodies[i])
+        self._active = np.setdiff1d(self._active, index)
+
     def step(self, targets: Array, delay: Array, offset: Array) -> None:
         """One control step of PD control.
 
@@ -256,38 +267,37 @@ class World:
             delay: (M,) s from a decision to its effect, below H control steps.
             offset: (M, 12) rad, error of each joint's zero.
         """
-        joints, robots = self._joints, list(zip(self._client_of, self._bodies, strict=True))
+        joints, live, state = self._joints, self._active, self.state
+        robots = [(self._client_of[i], self._bodies[i]) for i in live]
+        clients = list(dict.fromkeys(client for client, _ in robots))
         dt, control_dt = self.physics.dt, self.physics.control_dt
-        rows = np.arange(self.num_robots)
         trunk_force = np.zeros(self.num_robots)
-        q, qd = self.state.q, self.state.qd
+        strength, offset, delay = self.strength[live], offset[live], delay[live]
+        q, qd = state.q[live], state.qd[live]
         for k in range(self.physics.substeps):
             age = np.ceil(np.maximum(delay - k * dt - 1e-9, 0.0) / control_dt).astype(int)
-            torque = pd_torque(targets[age, rows] + offset - q, qd, self.strength, self.robot)
+            torque = pd_torque(targets[age, live] + offset - q, qd, strength, self.robot)
             for (client, body), forces in zip(robots, torque.tolist(), strict=True):
                 client.setJointMotorControlArray(
                     body, joints, pybullet.TORQUE_CONTROL, forces=forces
                 )
             started = time.perf_counter()
-            for client in self._clients:
+            for client in clients:
                 client.stepSimulation()
             self.bullet_seconds += time.perf_counter() - started
             flat = [s for client, body in robots for s in client.getJointStates(body, joints)]
             q = np.array([s[0] for s in flat]).reshape(-1, NUM_JOINTS)
             qd = np.array([s[1] for s in flat]).reshape(-1, NUM_JOINTS)
             force = np.zeros(self.num_robots)
-            for client in self._clients:
+            for client in clients:
                 for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=-1):
                     force[client.rows[contact[2]]] += contact[9]
             np.maximum(trunk_force, force, out=trunk_force)
-        state = self.state
-        state.q, state.qd, state.torque, state.trunk_force = q, qd, torque, trunk_force
-        bases = [client.getBasePositionAndOrientation(body) for client, body in robots]
-        speeds = [client.getBaseVelocity(body) for client, body in robots]
-        state.position = np.array([b[0] for b in bases])
-        state.quaternion = np.array([b[1] for b in bases])
-        state.lin_vel = np.array([s[0] for s in speeds])
-        state.ang_vel = np.array([s[1] for s in speeds])
+        state.q[live], state.qd[live], state.torque[live] = q, qd, torque
+        state.trunk_force = trunk_force
+        for i, (client, body) in zip(live, robots, strict=True):
+            state.position[i], state.quaternion[i] = client.getBasePositionAndOrientation(body)
+            state.lin_vel[i], state.ang_vel[i] = client.getBaseVelocity(body)
         state.derive()
         self._read_contacts()
 
@@ -295,31 +305,27 @@ class World:
         """Forces of the last physics step, split into feet and the legs above them.
 
         The foot is the end of the calf link, so a calf contact counts as the foot's when it is
-        within reach of the foot's centre.
+        within reach of the foot's centre. Plain lists: indexing arrays one contact at a time
+        would take longer than all the rest of a step.
         """
-        state = self.state
-        state.foot_force = np.zeros((self.num_robots, 4))
-        state.leg_force = np.zeros((self.num_robots, 4))
-        contacts = [
-            (client.rows[contact[2]], contact)
-            for client in self._clients
-            for contact in client.getContactPoints(bodyA=client.ground)
-        ]
-        for row, contact in contacts:
-            force, link = contact[9], contact[4]
-            if force <= 0.0 or link < 0:
-                continue
-            leg = self._leg_of_link[link]
-            if link in self._calf_links:
-                foot = state.foot_position[row, leg]
-                point = contact[6]
-                away = (
-                    (point[0] - foot[0]) ** 2 + (point[1] - foot[1]) ** 2 + (point[2] - foot[2]) ** 2
-                )
-                if away < (FOOT_RADIUS + _FOOT_REACH) ** 2:
-                    state.foot_force[row, leg] += force
+        feet = self.state.foot_position.tolist()
+        foot_force = [[0.0] * 4 for _ in range(self.num_robots)]
+        leg_force = [[0.0] * 4 for _ in range(self.num_robots)]
+        reach = (FOOT_RADIUS + _FOOT_REACH) ** 2
+        for client in self._clients:
+            for contact in client.getContactPoints(bodyA=client.ground):
+                force, link = contact[9], contact[4]
+                if force <= 0.0 or link < 0:
                     continue
-            state.leg_force[row, leg] += force
+                row, leg = client.rows[contact[2]], self._leg_of_link[link]
+                if link in self._calf_links:
+                    (x, y, z), (fx, fy, fz) = contact[6], feet[row][leg]
+                    if (x - fx) ** 2 + (y - fy) ** 2 + (z - fz) ** 2 < reach:
+                        foot_force[row][leg] += force
+                        continue
+                leg_force[row][leg] += force
+        self.state.foot_force = np.array(foot_force)
+        self.state.leg_force = np.array(leg_force)
 
     def ground_height(self, x: Array, y: Array) -> Array:
         """Surface height in m under points of any shape."""

@@ -148,7 +148,7 @@ def test_bad_push_changes_nothing(envs, successes, message):
 
 @pytest.mark.parametrize("start", [-1, 11, [0, 0, 11]])
 def test_start_must_be_a_level(start):
-    with pytest.raises(ValueError, match="0..10"):
+    with pytest.raises(ValueError, match=r"0\.\.10"):
         Curriculum(3, W, S, LEVELS, start=start)
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import pickle
 import resource
 from pathlib import Path
@@ -343,6 +344,16 @@ def test_what_cannot_be_read_back_is_not_written(tmp_path):
         with pytest.raises(ValueError, match=message):
             policies.save(tmp_path / "out" / "p", policy, meta)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_files_are_replaced_not_written_over(saved):
+    """Whoever has the old files open goes on reading the old policy."""
+    old = saved.parent / "old"
+    for suffix in (".json", ".safetensors"):
+        os.link(f"{saved}{suffix}", f"{old}{suffix}")
+    policies.save(saved, lstm_policy(), {"seed": 1})
+    assert policies.load(old).meta == {"seed": 42} and policies.load(old).kind == "mlp"
+    assert policies.load(saved).meta == {"seed": 1} and policies.load(saved).kind == "lstm"
 
 
 def test_failed_write_leaves_the_old_policy_and_no_scraps(saved):

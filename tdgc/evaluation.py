@@ -1,0 +1,452 @@
+"""Evaluation (TDGC-Bench): episodes on fixed tiles -> rows -> rates with Wilson intervals.
+
+An episode is a function of its policy, condition and tile alone. Episodes run in batches, each in
+a world of its own that holds one tile a robot; the batches do not depend on how many processes
+share them, so neither does the table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import multiprocessing as mp
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.commands import CONTINUOUS, INDEX, default_command, gait_index
+from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, from_dict
+from tdgc.gaits import GAITS, gait_embedding
+from tdgc.locomotion import Locomotion
+from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE
+from tdgc.policies import Policy
+from tdgc.rewards import CONTACT_FORCE
+from tdgc.robot import Array, wrap_angle
+from tdgc.terrain import EVAL_STREAM, FAMILIES, MAX_LEVEL, TileField, make_tile, tile_rng
+from tdgc.vec import one_blas_thread
+
+HORIZON = 20.0  # s (benchmark)
+OUTCOMES = ("reached", "fell", "collided", "left_tile", "timeout")
+BATCH = 20  # episodes a world: enough to keep numpy busy, few enough to share out evenly
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One evaluation condition (benchmark); everything is nominal unless it says otherwise.
+
+    Attributes:
+        levels, families: where the condition is run; None for those asked for.
+        episodes_share: of the episodes asked for, a cell (100 nominal, 20 for the others).
+    """
+
+    levels: tuple[int, ...] | None = None
+    families: tuple[str, ...] | None = None
+    friction: float | None = None
+    payload: float = 0.0  # kg
+    push_speed: float = 0.0  # m/s, every 3 s
+    motor: float = 1.0  # times torque limits and gains
+    latency: float = 0.0  # s
+    physics_hz: int | None = None
+    episodes_share: float = 0.2
+
+
+#: The conditions of the benchmark by name.
+CONDITIONS: dict[str, Condition] = {
+    "nominal": Condition(episodes_share=1.0),
+    "levels-11-12": Condition(levels=(11, 12)),
+    "mixed": Condition(families=("mixed",)),
+    "friction-0.4": Condition(friction=0.4),
+    "payload-3kg": Condition(payload=3.0),
+    "pushes": Condition(push_speed=0.75),
+    "motor-0.85": Condition(motor=0.85),
+    "latency-30ms": Condition(latency=0.03),
+    "physics-1000hz": Condition(physics_hz=1000),
+}
+PUSH_INTERVAL = 3.0  # s (benchmark's `pushes`)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A batch of episodes: numbers ``first`` to ``first + count`` of one family and level."""
+
+    policy: str
+    condition: str
+    family: str
+    level: int
+    first: int
+    count: int
+
+
+@dataclass
+class Episode:
+    """A row of episodes.csv."""
+
+    policy: str
+    condition: str
+    family: str
+    level: int
+    episode: int
+    seed: int
+    outcome: str
+    time_s: float
+    path_m: float
+    shares: tuple[float, ...] = field(default=(0.0,) * len(GAITS))
+
+    def row(self) -> dict[str, Any]:
+        """Flat dict with one column a gait share."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)[:-1]}
+        values["time_s"], values["path_m"] = round(self.time_s, 2), round(self.path_m, 3)
+        return values | {
+            f"share_{gait}": round(share, 4) for gait, share in zip(GAITS, self.shares, strict=True)
+        }
+
+
+class Driver(Protocol):
+    """What decides on commands in an evaluation: ``gp``, or the high level."""
+
+    def begin(self, loco: Locomotion, goal: Array) -> None:
+        """New episodes for all robots of ``loco``; ``goal`` (M, 2) m in the world."""
+
+    def command(self, step: int) -> Array:
+        """Commands (M, 15) for the coming control step number ``step``."""
+
+
+@dataclass(frozen=True)
+class GoToGoal:
+    """``gp``, the paper's baseline: a scripted law over the same frozen low level.
+
+    Walks in trot with default behaviour parameters, as fast as the distance asks, turning by the
+    heading error, and slows while it faces away. No terrain cues. Gains tuned on training tiles
+    (docs/experiments.md).
+    """
+
+    top_speed: float = 0.8  # m/s
+    distance_gain: float = 1.0  # 1/s
+    heading_gain: float = 1.5  # 1/s
+    swing_height: float = 0.08  # m
+
+    def law(self, position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
+        """Forward speed and yaw rate: positions (M, 2), headings (M,), goals (M, 2)."""
+        offset = goal - position
+        error = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - yaw)
+        speed = np.minimum(self.top_speed, self.distance_gain * np.linalg.norm(offset, axis=1))
+        turn = np.clip(self.heading_gain * error, *CommandRanges().yaw_rate)
+        return speed * np.maximum(np.cos(error), 0.0), turn
+
+
+class GaitPolicyDriver:
+    """Drives robots by ``GoToGoal``."""
+
+    def __init__(self, law: GoToGoal | None = None) -> None:
+        self.law = law or GoToGoal()
+
+    def begin(self, loco: Locomotion, goal: Array) -> None:
+        self._loco, self._goal = loco, goal
+        self._command = np.tile(default_command(), (loco.num_robots, 1))
+        self._command[:, INDEX["swing_height"]] = self.law.swing_height
+
+    def command(self, step: int) -> Array:
+        state = self._loco.world.state
+        speed, turn = self.law.law(state.position[:, :2], state.yaw, self._goal)
+        self._command[:, INDEX["vx"]], self._command[:, INDEX["yaw_rate"]] = speed, turn
+        return self._command
+
+
+def low_config(low: Policy) -> LowLevelConfig:
+    """The MDP that a low-level policy was trained on, from its own file.
+
+    Raises:
+        ValueError: the file holds none, or one that does not fit the policy.
+    """
+    if "config" not in low.meta:
+        raise ValueError("the low-level policy's file has no configuration")
+    return from_dict(LowLevelConfig, low.meta["config"])
+
+
+def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
+    """The condition's physics: its rate, at the low level's control rate."""
+    physics = config.physics
+    if condition.physics_hz is not None:
+        substeps = round(physics.control_dt * condition.physics_hz)
+        physics = dataclasses.replace(physics, substeps=substeps)
+    return physics
+
+
+def push_velocities(cell: Cell, seed: int, speed: float, pushes: int) -> Array:
+    """Push k of each episode, (count, pushes, 3) m/s: the same for every policy."""
+    result = np.zeros((cell.count, pushes, 3))
+    for k in range(cell.count):
+        entropy = (EVAL_STREAM, seed, FAMILIES_INDEX[cell.family], cell.level, cell.first + k, 1)
+        angle = np.random.default_rng(entropy).uniform(-np.pi, np.pi, pushes)
+        result[k, :, 0], result[k, :, 1] = speed * np.cos(angle), speed * np.sin(angle)
+    return result
+
+
+FAMILIES_INDEX = {name: i for i, name in enumerate((*FAMILIES, "mixed"))}
+
+
+def run_cell(cell: Cell, low: Policy, driver: Driver, seed: int) -> list[Episode]:
+    """Run a batch of episodes to their ends.
+
+    Args:
+        cell: which episodes.
+        low: the frozen low level.
+        driver: what commands it.
+        seed: of the evaluation's tiles.
+
+    Returns:
+        A row an episode, in order.
+    """
+    config, condition = low_config(low), CONDITIONS[cell.condition]
+    m = cell.count
+    tiles_ = TileField((m, 1))
+    for k in range(m):
+        rng = tile_rng(seed, cell.family, cell.level, cell.first + k, EVAL_STREAM)
+        tiles_.place(k, 0, make_tile(cell.family, cell.level / MAX_LEVEL, rng))
+    loco = Locomotion(m, config.robot, physics_of(config, condition), tiles_, config.gyro)
+    rows = np.arange(m)
+    origin = tiles_.origin(rows, 0)
+    start, goal = tiles_.starts[:, 0], tiles_.goals[:, 0] + origin
+    friction = condition.friction if condition.friction is not None else config.physics.friction
+    loco.friction[:], loco.payload[:] = friction, condition.payload
+    loco.world.strength[:] = condition.motor
+    loco.delay[:] = condition.latency
+    loco.world.set_dynamics(rows, loco.friction, loco.payload)
+    loco.place(rows, start[:, :2] + origin, start[:, 2], np.zeros(m))
+    driver.begin(loco, goal)
+
+    dt = config.physics.control_dt
+    horizon = round(HORIZON / dt)
+    push_every = round(PUSH_INTERVAL / dt)
+    pushes = push_velocities(cell, seed, condition.push_speed, horizon // push_every + 1)
+    outcome = np.full(m, -1)
+    steps = np.zeros(m, dtype=int)
+    path = np.zeros(m)
+    shares = np.zeros((m, len(GAITS)))
+    world = loco.world
+    try:
+        for step in range(horizon):
+            live = np.flatnonzero(outcome < 0)
+            if condition.push_speed > 0.0 and step > 0 and step % push_every == 0:
+                world.push(live, pushes[live, step // push_every - 1])
+            before = world.state.position[:, :2].copy()
+            loco.command[:] = driver.command(step)
+            actions, _ = low.predict(loco.observe())
+            loco.act(actions)
+            path[live] += np.linalg.norm(world.state.position[live, :2] - before[live], axis=1)
+            shares[live, gait_index(loco.command[live])] += 1.0
+            steps[live] = step + 1
+            ended = classify(loco, goal, tiles_)
+            ended[ended < 0] = -1 if step + 1 < horizon else OUTCOMES.index("timeout")
+            done = live[ended[live] >= 0]
+            outcome[done] = ended[done]
+            if done.size:
+                world.retire(done)
+            if (outcome >= 0).all():
+                break
+    finally:
+        world.close()
+    return [
+        Episode(
+            cell.policy, cell.condition, cell.family, cell.level, cell.first + k, seed,
+            OUTCOMES[outcome[k]], steps[k] * dt, path[k], tuple(shares[k] / steps[k]),
+        )
+        for k in range(m)
+    ]  # fmt: skip
+
+
+def classify(loco: Locomotion, goal: Array, tiles_: TileField) -> NDArray[np.int64]:
+    """Index into OUTCOMES of each robot's present end, -1 for none, (M,).
+
+    Failure goes before success: a robot that falls into the goal has fallen.
+    """
+    state, world = loco.world.state, loco.world
+    x, y = state.position[:, 0], state.position[:, 1]
+    outcome = np.full(loco.num_robots, -1)
+    reached = np.linalg.norm(state.position[:, :2] - goal, axis=1) < GOAL_RADIUS
+    outcome[reached] = OUTCOMES.index("reached")
+    inside = tiles_.on_tile(np.arange(loco.num_robots), 0, x, y)
+    outcome[~inside] = OUTCOMES.index("left_tile")
+    outcome[state.trunk_force > TRUNK_FORCE] = OUTCOMES.index("collided")
+    fallen = state.position[:, 2] - world.support_height(x, y) < FALL_HEIGHT
+    outcome[fallen] = OUTCOMES.index("fell")
+    return outcome
+
+
+# ---------------------------------------------------------------------------- the whole table
+
+
+def plan(
+    policies: Sequence[str],
+    conditions: Sequence[str],
+    families: Sequence[str],
+    levels: Sequence[int],
+    episodes: int,
+) -> list[Cell]:
+    """All batches of an evaluation, in the order of the table."""
+    cells = []
+    for policy in policies:
+        for name in conditions:
+            condition = CONDITIONS[name]
+            count = max(1, round(condition.episodes_share * episodes))
+            for family in condition.families or families:
+                for level in condition.levels or levels:
+                    for first in range(0, count, BATCH):
+                        size = min(BATCH, count - first)
+                        cells.append(Cell(policy, name, family, level, first, size))
+    return cells
+
+
+def run_cells(
+    cells: Sequence[Cell], work: Callable[[Cell], list[Episode]], workers: int
+) -> Iterator[list[Episode]]:
+    """``work`` on each cell, in order, on ``workers`` processes."""
+    if workers == 1:
+        yield from map(work, cells)
+        return
+    with one_blas_thread(), mp.get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap(work, cells)
+
+
+def wilson_interval(reached: int, n: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson score interval of a rate, 95 % by default (Wilson 1927)."""
+    if not 0 <= reached <= n or n < 1:
+        raise ValueError(f"need 0 <= reached <= n and n >= 1, not {reached} of {n}")
+    rate = reached / n
+    centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * np.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
+
+
+def _rate(rows: Sequence[Episode]) -> dict[str, float]:
+    n, reached = len(rows), sum(e.outcome == "reached" for e in rows)
+    low, high = wilson_interval(reached, n)
+    return {"n": n, "reached": reached, "rate": reached / n, "ci_low": low, "ci_high": high}
+
+
+def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:
+    """summary.json: policy -> condition -> family -> level -> rates, and means.
+
+    Beside the levels of a family stands ``"mean"`` over them, beside the families ``"mean"`` over
+    all; cells are equally large, so these are means over cells too.
+    """
+    tree: dict[str, Any] = {}
+    for e in episodes:
+        families = tree.setdefault(e.policy, {}).setdefault(e.condition, {})
+        families.setdefault(e.family, {}).setdefault(str(e.level), []).append(e)
+    for conditions in tree.values():
+        for families in conditions.values():
+            everything: list[Episode] = []
+            for levels in families.values():
+                rows = [e for level in levels.values() for e in level]
+                everything += rows
+                for level, some in levels.items():
+                    levels[level] = _rate(some)
+                levels["mean"] = _rate(rows)
+            families["mean"] = _rate(everything)
+    return tree
+
+
+# ---------------------------------------------------------------------------- tracking
+
+_TRACKING_SECONDS = 10.0  # an episode: one command
+_SETTLE_SECONDS = 1.0  # not counted: speeding up from rest
+_SWITCH_SECONDS = 2.0  # between gaits in the falls test
+_FALL_ROBOTS, _FALL_SECONDS = 60, 20.0  # 20 minutes of walking
+
+
+def _commands(rng: np.random.Generator, ranges: CommandRanges, n: int) -> Array:
+    bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
+    return np.asarray(rng.uniform(bounds[:, 0], bounds[:, 1], (n, len(CONTINUOUS))))
+
+
+def _walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Locomotion]:
+    """Yield before each control step, so that the caller may set commands and look."""
+    config = low_config(low)
+    loco = Locomotion(m, config.robot, config.physics, None, config.gyro)
+    rows = np.arange(m)
+    rng = np.random.default_rng(seed)
+    spots = np.stack([rows % 10, rows // 10], axis=1) * 5.0
+    loco.place(rows, spots, rng.uniform(-np.pi, np.pi, m), rng.uniform(size=m))
+    try:
+        for _ in range(round(seconds / config.physics.control_dt)):
+            yield loco
+            actions, _ = low.predict(loco.observe())
+            loco.act(actions)
+    finally:
+        loco.world.close()
+
+
+def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, float]:
+    """Tracking of one gait on the plane, commands over the full ranges.
+
+    RMSE of the instantaneous planar velocity (heading frame) and yaw rate at every control step
+    after the first second, and the share of foot samples whose contact is the desired one.
+    """
+    config, g = low_config(low), GAITS.index(gait)
+    rng = np.random.default_rng((EVAL_STREAM, seed, g))
+    command = np.concatenate(
+        [_commands(rng, config.commands, episodes), np.tile(gait_embedding(g), (episodes, 1))],
+        axis=1,
+    )
+    settle = round(_SETTLE_SECONDS / config.physics.control_dt)
+    lin = yaw = match = count = 0.0
+    for step, loco in enumerate(_walk_on_plane(low, episodes, _TRACKING_SECONDS, seed)):
+        state = loco.world.state
+        if step > settle:
+            lin += float(np.sum((state.heading_vel[:, :2] - command[:, :2]) ** 2))
+            yaw += float(np.sum((state.ang_vel[:, 2] - command[:, INDEX["yaw_rate"]]) ** 2))
+            wanted = loco.clock.contact > 0.5
+            match += float(np.mean((state.foot_force > CONTACT_FORCE) == wanted)) * episodes
+            count += episodes
+        loco.command[:] = command
+    return {
+        "velocity_rmse": (lin / count) ** 0.5,
+        "yaw_rate_rmse": (yaw / count) ** 0.5,
+        "contact_match": match / count,
+    }
+
+
+def count_falls(low: Policy, seed: int) -> dict[str, float]:
+    """Falls while the gait switches at random every 2 s, commands over the full ranges.
+
+    A robot that falls stays out, and its time counts up to the fall.
+    """
+    config = low_config(low)
+    m, dt = _FALL_ROBOTS, config.physics.control_dt
+    rng = np.random.default_rng((EVAL_STREAM, seed, len(GAITS)))
+    switch = round(_SWITCH_SECONDS / dt)
+    command = np.zeros((m, 15))
+    command[:, :12] = _commands(rng, config.commands, m)
+    up = np.ones(m, dtype=bool)
+    minutes = 0.0
+    for step, loco in enumerate(_walk_on_plane(low, m, _FALL_SECONDS, seed)):
+        state = loco.world.state
+        up &= (state.position[:, 2] > FALL_HEIGHT) & (state.trunk_force <= TRUNK_FORCE)
+        minutes += up.sum() * dt / 60.0
+        if step % switch == 0:
+            command[:, 12:] = gait_embedding(rng.integers(0, len(GAITS), m))
+        loco.command[:] = command
+    falls = int((~up).sum())
+    return {"falls": falls, "minutes": minutes, "falls_per_10_min": 10.0 * falls / minutes}
+
+
+def _track(job: tuple[str, int, int], low: Policy) -> dict[str, float]:
+    gait, episodes, seed = job
+    return track_gait(low, gait, episodes, seed) if gait else count_falls(low, seed)
+
+
+def tracking(low: Policy, episodes: int, seed: int, workers: int) -> dict[str, Any]:
+    """tracking.json: each gait's tracking and the falls."""
+    jobs = [(gait, episodes, seed) for gait in GAITS] + [("", 0, seed)]
+    work = functools.partial(_track, low=low)
+    if workers == 1:
+        results = [work(job) for job in jobs]
+    else:
+        with one_blas_thread(), mp.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
+            results = pool.map(work, jobs, chunksize=1)
+    falls = results.pop()
+    return {"gaits": dict(zip(GAITS, results, strict=True)), **falls}

@@ -1,0 +1,479 @@
+"""The decision-level MDP (paper Sec. IV-B, IV-C) around a frozen low-level policy.
+
+``NavigationTask`` is the MDP for M robots at once, each on a tile of its own whose level the
+curriculum sets; ``NavigationEnv`` is its Gymnasium face for one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc import policies, rewards
+from tdgc.commands import NUM_ACTIONS, CommandDecoder, gait_index
+from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig, from_dict
+from tdgc.curriculum import Curriculum
+from tdgc.gaits import GAITS
+from tdgc.locomotion import SPEED_SCALE, Locomotion
+from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE
+from tdgc.policies import Policy
+from tdgc.robot import NUM_JOINTS, Array, wrap_angle
+from tdgc.terrain import (
+    FAMILIES,
+    MAX_LEVEL,
+    TRAIN_STREAM,
+    TileField,
+    draw_start_goal,
+    make_tile,
+    tile_rng,
+)
+from tdgc.world import World
+
+#: Where the shipped policies are.
+PRETRAINED = Path(__file__).resolve().parent / "pretrained"
+
+_CROP = 2.0  # m off both sides of training tiles: Bullet keeps 600 bytes a sample
+_GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
+_PROBE_RANGE = 0.5  # m, deeper and higher looks the same
+
+#: The sparse geometric cue: 32 heights in the heading frame, denser where the feet come next.
+PROBES: Array = np.array(
+    [
+        (x, y)
+        for x in (-0.2, 0.1, 0.3, 0.5, 0.7, 0.9, 1.2, 1.6)
+        for y in (0.3, 0.1, -0.1, -0.3)
+    ]
+)
+#: The semantic cue: one-hot over the families, and one place for "unknown".
+SEMANTIC = (*FAMILIES, "unknown")
+
+
+def high_layout(cues: str) -> tuple[tuple[str, int], ...]:
+    """Names and sizes of the parts of the high level's observation o^H, in order."""
+    layout = [
+        ("goal", 3),
+        ("time_left", 1),
+        ("gravity", 3),
+        ("joint_error", NUM_JOINTS),
+        ("joint_speed", NUM_JOINTS),
+        ("last_action", NUM_ACTIONS),
+        ("clock", 4),
+    ]
+    if cues in ("both", "semantic"):
+        layout.append(("family", len(SEMANTIC)))
+    if cues in ("both", "geometric"):
+        layout.append(("probes", len(PROBES)))
+    return tuple(layout)
+
+
+def height_probes(loco: Locomotion) -> Array:
+    """Ground under ``PROBES`` against where a standing robot's ground would be, (M, 32) m."""
+    state = loco.world.state
+    c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
+    x = state.position[:, :1] + c * PROBES[:, 0] - s * PROBES[:, 1]
+    y = state.position[:, 1:2] + s * PROBES[:, 0] + c * PROBES[:, 1]
+    standing = state.position[:, 2:3] - loco.robot.base_height
+    return np.clip(loco.world.ground_height(x, y) - standing, -_PROBE_RANGE, _PROBE_RANGE)
+
+
+def observe_high(
+    loco: Locomotion,
+    goal: Array,
+    time_share: Array,
+    last_action: Array,
+    families: NDArray[np.int64],
+    cues: str,
+) -> NDArray[np.float32]:
+    """o^H of M robots, (M, sum of ``high_layout``).
+
+    Args:
+        loco: the robots.
+        goal: (M, 2) m in the world.
+        time_share: (M,) t / T_max.
+        last_action: (M, 13), normalised.
+        families: (M,) index into ``SEMANTIC``.
+        cues: both, semantic, geometric or none.
+    """
+    state = loco.world.state
+    offset = goal - state.position[:, :2]
+    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
+    distance = np.linalg.norm(offset, axis=1)
+    parts = [
+        np.stack([_GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1),
+        1.0 - time_share[:, None],
+        state.gravity,
+        state.q - loco.joint_offset - loco.nominal,
+        SPEED_SCALE * state.qd,
+        last_action,
+        loco.clock.signal(),
+    ]
+    if cues in ("both", "semantic"):
+        parts.append(np.eye(len(SEMANTIC))[families])
+    if cues in ("both", "geometric"):
+        parts.append(height_probes(loco) / _PROBE_RANGE)
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def check_pair(high: HighLevelConfig, low: LowLevelConfig) -> None:
+    """Refuse decoder bounds that the low level was not trained on.
+
+    Raises:
+        ConfigError: names the command and both ranges.
+    """
+    for f in dataclasses.fields(low.commands):
+        asked, trained = getattr(high.commands, f.name), getattr(low.commands, f.name)
+        if asked[0] < trained[0] or asked[1] > trained[1]:
+            raise ConfigError(
+                f"commands.{f.name} asks for {list(asked)}, but the low level was trained on "
+                f"{list(trained)}"
+            )
+
+
+def load_low(path: str | Path) -> tuple[Policy, LowLevelConfig]:
+    """A low-level policy and the MDP it was trained on.
+
+    Raises:
+        ValueError: a file that cannot be used, or that is no low level.
+    """
+    low = policies.load(path)
+    if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
+        raise ConfigError(f"{path}: not a low-level policy of this package")
+    return low, from_dict(LowLevelConfig, low.meta["config"])
+
+
+class NavigationTask:
+    """The high-level MDP of M robots.
+
+    An action is (M, 13) in [-a_max, a_max]; it is decoded and held for ``decimation`` control
+    steps of the frozen low level. An episode fails when the trunk is low, hits something hard, or
+    the robot leaves its tile; it is truncated after 20 s, or 2 s after the goal was reached.
+
+    Args:
+        config: the MDP's configuration.
+        low: path of the low-level policy.
+        num_robots: M.
+        seed: of everything random here.
+        training: draw disturbances and let the curriculum move levels.
+    """
+
+    def __init__(
+        self,
+        config: HighLevelConfig,
+        low: str | Path,
+        num_robots: int,
+        seed: int,
+        training: bool = True,
+    ) -> None:
+        self.config = config
+        self.num_robots = m = num_robots
+        self.training = training
+        self.low, self.low_config = load_low(low)
+        check_pair(config, self.low_config)
+        self.decoder = CommandDecoder(config.commands, config.action_limit)
+        self.rng = np.random.default_rng(seed)
+        self._seed, self._tiles_drawn = seed, 0
+        self.step_seconds = config.decimation * self.low_config.physics.control_dt
+        self.horizon = round(config.episode_seconds / self.step_seconds)
+        self._hold = round(config.hold_seconds / self.step_seconds)
+        self.family = np.arange(m) % len(config.families)
+        self.curriculum = Curriculum(m, config.window, config.threshold, config.levels)
+        self.field = TileField((m, 1), crop=_CROP)
+        self._drawn_level = np.full(m, -1)
+        self.locomotion = self._build_locomotion()
+        self._origin = self.field.origin(np.arange(m), 0)
+        self.goal = np.zeros((m, 2))
+        self.elapsed = np.zeros(m, dtype=np.int64)
+        self._reached_at = np.full(m, -1)
+        self._next_push = np.zeros(m)
+        self._actions = np.zeros((2, m, NUM_ACTIONS))
+        self._commands = np.zeros((3, m, 15))
+        self.stats: dict[str, float] = {}
+        size = sum(width for _, width in high_layout(config.cues))
+        self.actor_dim = size
+        limit = config.action_limit
+        self.action_space = gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    def _build_locomotion(self) -> Locomotion:
+        self._draw_tiles(np.flatnonzero(self._drawn_level != self.curriculum.levels))
+        c = self.low_config
+        return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro)
+
+    def _draw_tiles(self, index: NDArray[np.integer]) -> None:
+        for i in index:
+            family, level = self.config.families[self.family[i]], int(self.curriculum.levels[i])
+            rng = tile_rng(self._seed, family, level, self._tiles_drawn, TRAIN_STREAM)
+            self._tiles_drawn += 1
+            self.field.place(int(i), 0, make_tile(family, level / MAX_LEVEL, rng))
+            self._drawn_level[i] = level
+
+    # ------------------------------------------------------------------ episodes
+
+    def reset(self, index: NDArray[np.integer]) -> None:
+        """Start new episodes for the robots ``index`` (n,), on fresh tiles after a new level."""
+        n, rng = len(index), self.rng
+        stale = index[self._drawn_level[index] != self.curriculum.levels[index]]
+        if stale.size:
+            self._draw_tiles(stale)
+            self.locomotion.world.upload_terrain(stale)
+        starts, goals = draw_start_goal(rng, (n,))
+        self.goal[index] = goals + self._origin[index]
+        self.elapsed[index] = 0
+        self._reached_at[index] = -1
+        if self.training:
+            width = self._width()[index]
+            self.locomotion.randomise(index, self.config.randomisation, rng, width)
+            self._schedule_push(index)
+        self._actions[:, index] = 0.0
+        self._commands[:, index] = self._share(self.decoder.decode(np.zeros(NUM_ACTIONS)))
+        self.locomotion.place(
+            index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
+        )
+
+    def _width(self) -> Array:
+        """How wide each robot's disturbances are: they grow with its level."""
+        return self.curriculum.levels / max(self.config.levels - 1, 1)
+
+    def _share(self, commands: Array) -> Array:
+        """Commands as shares of the decoder's ranges, so that their differences have one scale."""
+        span = np.where(self.decoder.high > self.decoder.low, self.decoder.high - self.decoder.low, 1)
+        return np.asarray((commands - self.decoder.low) / span)
+
+    def restart(self) -> None:
+        """End every episode, draw new tiles and build the world anew (see ``LowLevelTask``)."""
+        self.locomotion.world.close()
+        self._drawn_level[:] = -1
+        self.locomotion = self._build_locomotion()
+        self.stats = {}
+        self.reset(np.arange(self.num_robots))
+
+    def step(
+        self, actions: NDArray[np.floating]
+    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+        """One decision: (M, 13) -> reward, terminated, truncated, (M,) each.
+
+        The order is the paper's: physics and low level, terminations and reaching, reward; the
+        caller resets afterwards.
+
+        Raises:
+            ValueError: a value that is not finite.
+        """
+        loco, c = self.locomotion, self.config
+        self._actions = np.stack([self.decoder.normalise(actions), self._actions[0]])
+        commands = self.decoder.decode(actions)
+        self._commands = np.concatenate([self._share(commands)[None], self._commands[:-1]])
+        loco.command[:] = commands
+        failed = np.zeros(self.num_robots, dtype=bool)
+        force = np.zeros((self.num_robots, 5))
+        reached = self._reached_at >= 0
+        for _ in range(c.decimation):
+            loco.act(self.low.predict(loco.observe(c.randomisation, self.rng))[0])
+            failed |= self._failed(loco.world)
+            state = loco.world.state
+            now = np.column_stack([state.trunk_force, state.leg_force])
+            np.maximum(force, now, out=force)
+            distance = np.linalg.norm(self.goal - state.position[:, :2], axis=1)
+            reached |= (distance < GOAL_RADIUS) & ~failed
+        self.elapsed += 1
+        self._reached_at[reached & (self._reached_at < 0)] = self.elapsed[
+            reached & (self._reached_at < 0)
+        ]
+        terms = rewards.high_terms(self._high_step(force), self.step_seconds)
+        reward = np.sum(list(terms.values()), axis=0)
+        held = reached & (self.elapsed - self._reached_at >= self._hold)
+        truncated = ~failed & (held | (self.elapsed >= self.horizon))
+        done = np.flatnonzero(failed | truncated)
+        self._count(terms, reward, commands, done, reached)
+        if self.training:
+            if done.size:
+                self.curriculum.push(done, reached[done])
+            self._push()
+        return reward, failed, truncated
+
+    def _failed(self, world: World) -> NDArray[np.bool_]:
+        state = world.state
+        x, y = state.position[:, 0], state.position[:, 1]
+        low = state.position[:, 2] - world.support_height(x, y) < FALL_HEIGHT
+        outside = ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
+        return np.asarray(low | (state.trunk_force > TRUNK_FORCE) | outside)
+
+    def _high_step(self, force: Array) -> rewards.HighStep:
+        loco = self.locomotion
+        state = loco.world.state
+        offset = self.goal - state.position[:, :2]
+        x, y = state.position[:, 0], state.position[:, 1]
+        return rewards.HighStep(
+            distance=np.linalg.norm(offset, axis=1),
+            heading_error=np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw,
+            time_share=self.elapsed / self.horizon,
+            lin_vel=state.lin_vel,
+            ang_vel=state.ang_vel,
+            joint_speed=state.qd,
+            base_height=state.position[:, 2] - loco.world.support_height(x, y),
+            standing_height=loco.robot.base_height,
+            actions=self._actions,
+            commands=self._commands,
+            contact_forces=force,
+            config=self.config.rewards,
+        )
+
+    def observe(self) -> NDArray[np.float32]:
+        """o^H, (M, actor_dim)."""
+        return observe_high(
+            self.locomotion,
+            self.goal,
+            self.elapsed / self.horizon,
+            self._actions[0],
+            self.family_index,
+            self.config.cues,
+        )
+
+    @property
+    def reached(self) -> NDArray[np.bool_]:
+        """Whether each robot has reached its goal in this episode, (M,)."""
+        return self._reached_at >= 0
+
+    @property
+    def family_index(self) -> NDArray[np.int64]:
+        """Index of each robot's family into ``SEMANTIC``, (M,)."""
+        names = [self.config.families[f] for f in self.family]
+        return np.array([SEMANTIC.index(n) if n in SEMANTIC else len(FAMILIES) for n in names])
+
+    # ------------------------------------------------------------------ disturbances
+
+    def _schedule_push(self, index: NDArray[np.integer]) -> None:
+        wait = self.rng.uniform(*self.config.randomisation.push_interval, len(index))
+        self._next_push[index] = self.elapsed[index] + wait / self.step_seconds
+
+    def _push(self) -> None:
+        index = np.flatnonzero(self.elapsed >= self._next_push)
+        if not index.size:
+            return
+        r = self.config.randomisation
+        angle = self.rng.uniform(-np.pi, np.pi, index.size)
+        top = r.scale * r.push_speed * self._width()[index]
+        speed = top * self.rng.uniform(size=index.size)
+        velocity = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+        self.locomotion.world.push(index, speed[:, None] * velocity)
+        self._schedule_push(index)
+
+    # ------------------------------------------------------------------ statistics, resume
+
+    def _count(
+        self,
+        terms: dict[str, Array],
+        reward: Array,
+        commands: Array,
+        done: NDArray[np.integer],
+        reached: NDArray[np.bool_],
+    ) -> None:
+        stats = self.stats
+
+        def add(key: str, value: float) -> None:
+            stats[key] = stats.get(key, 0.0) + float(value)
+
+        add("steps", self.num_robots)
+        add("reward", reward.sum())
+        for name, value in terms.items():
+            add(f"term/{name}", value.sum())
+        gait = gait_index(commands)
+        for col, family in enumerate(self.config.families):
+            mine = self.family == col
+            ended = done[mine[done]]
+            add(f"family/{family}/count", mine.sum())
+            add(f"family/{family}/level", self.curriculum.levels[mine].sum())
+            add(f"family/{family}/episodes", ended.size)
+            add(f"family/{family}/reached", reached[ended].sum())
+            for g, name in enumerate(GAITS):
+                add(f"family/{family}/{name}", (gait[mine] == g).sum())
+
+    def take_stats(self) -> dict[str, float]:
+        """The sums since the last call."""
+        stats, self.stats = self.stats, {}
+        stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
+        return stats
+
+    def state_dict(self) -> dict[str, Any]:
+        """JSON-ready state from which ``restart`` gives the same future everywhere."""
+        curriculum = {k: np.asarray(v).tolist() for k, v in self.curriculum.state_dict().items()}
+        return {
+            "rng": self.rng.bit_generator.state,
+            "tiles_drawn": self._tiles_drawn,
+            "curriculum": curriculum,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a ``state_dict``; call ``restart`` afterwards."""
+        self.rng.bit_generator.state = state["rng"]
+        self._tiles_drawn = int(state["tiles_drawn"])
+        self.curriculum.load_state_dict({k: np.array(v) for k, v in state["curriculum"].items()})
+
+    def close(self) -> None:
+        """Disconnect from Bullet."""
+        self.locomotion.world.close()
+
+
+class NavigationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One robot of ``NavigationTask`` as a Gymnasium environment, id ``tdgc/Navigation-v0``."""
+
+    metadata = {"render_modes": [], "render_fps": 10}
+
+    def __init__(
+        self,
+        config: HighLevelConfig | None = None,
+        low: str | Path = PRETRAINED / "low",
+        render_mode: str | None = None,
+    ) -> None:
+        self.config, self._low = config or HighLevelConfig(), low
+        self.render_mode = render_mode
+        self.task = NavigationTask(self.config, low, 1, seed=0)
+        self.action_space = self.task.action_space
+        self.observation_space = self.task.observation_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; a seed makes all that follows repeatable."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.task.close()
+            self.task = NavigationTask(self.config, self._low, 1, seed=seed)
+        self.task.reset(np.arange(1))
+        return self.task.observe()[0], {}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """One decision; ``info`` has whether the goal was reached."""
+        reward, terminated, truncated = self.task.step(np.asarray(action)[None])
+        info = {"is_success": bool(self.task.reached[0])}
+        obs = self.task.observe()[0]
+        return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def close(self) -> None:
+        """Disconnect from Bullet."""
+        self.task.close()
+
+
+def summarise(sums: dict[str, float]) -> dict[str, float]:
+    """Sums of ``NavigationTask.take_stats`` over all workers -> values to log."""
+    steps = max(sums.get("steps", 0.0), 1.0)
+    values = {"reward/total": sums.get("reward", 0.0) / steps}
+    for key, value in sums.items():
+        if key.startswith("term/"):
+            values[f"reward/{key[5:]}"] = value / steps
+    families = [k.split("/")[1] for k in sums if k.startswith("family/") and k.endswith("/count")]
+    for family in families:
+        count = max(sums[f"family/{family}/count"], 1.0)
+        values[f"level/{family}"] = sums[f"family/{family}/level"] / count
+        episodes = sums[f"family/{family}/episodes"]
+        if episodes:
+            values[f"success/{family}"] = sums[f"family/{family}/reached"] / episodes
+        for gait in GAITS:
+            values[f"gait/{family}_{gait}"] = sums[f"family/{family}/{gait}"] / count
+    return values

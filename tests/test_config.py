@@ -1,0 +1,170 @@
+"""Configuration: the JSON round trip, and every way to get a key or a value wrong."""
+
+import dataclasses
+import json
+from typing import Any
+
+import pytest
+
+from tdgc.config import (
+    CommandRanges,
+    ConfigError,
+    LowLevelConfig,
+    LowTrainConfig,
+    PhysicsConfig,
+    RobotConfig,
+    from_dict,
+    to_dict,
+    with_overrides,
+)
+
+
+def test_json_round_trip_of_the_defaults() -> None:
+    config = LowTrainConfig()
+    assert from_dict(LowTrainConfig, json.loads(json.dumps(to_dict(config)))) == config
+
+
+def test_json_round_trip_of_changed_values() -> None:
+    robot = RobotConfig(kp=25.5, nominal_thigh=(1.0, 0.8))
+    env = LowLevelConfig(
+        terrain="tiles", families=("stair",), gyro=True, robot=robot,
+        commands=CommandRanges(vx=(-0.25, 0.75)),
+    )  # fmt: skip
+    config = LowTrainConfig(seed=7, env=env)
+    back = from_dict(LowTrainConfig, json.loads(json.dumps(to_dict(config))))
+    assert back == config
+    assert back.env.robot.nominal_thigh == (1.0, 0.8)
+    assert back.env.families == ("stair",)
+    assert back.env.commands.vx == (-0.25, 0.75)
+
+
+def test_missing_keys_keep_their_defaults() -> None:
+    config = from_dict(LowTrainConfig, {"seed": 3, "env": {"robot": {"kd": 0.5}}})
+    expected = LowTrainConfig(seed=3, env=LowLevelConfig(robot=RobotConfig(kd=0.5)))
+    assert config == expected
+
+
+def test_a_whole_number_is_a_float_but_not_the_other_way_round() -> None:
+    config = from_dict(RobotConfig, {"kp": 25})
+    assert config.kp == 25.0 and isinstance(config.kp, float)
+    with pytest.raises(ConfigError, match=r"^'n_envs' must be of type int, not 2\.0$"):
+        from_dict(LowTrainConfig, {"n_envs": 2.0})
+
+
+def test_physics_step() -> None:
+    assert PhysicsConfig().dt == pytest.approx(0.0025, abs=1e-15)
+    assert PhysicsConfig(substeps=4).dt == pytest.approx(0.005, abs=1e-15)
+
+
+def test_configurations_cannot_be_changed_in_place() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        LowTrainConfig().seed = 1  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"sed": 1}, "unknown configuration key 'sed'; allowed: seed, n_envs"),
+        ({"env": {"robot": {"kq": 1}}}, "unknown configuration key 'env.robot.kq'; allowed: urdf"),
+        ({"env": {"robot": 5}}, "env.robot must be a table of keys, not 5"),
+        ({"env": []}, r"env must be a table of keys, not \[\]"),
+        ({"seed": True}, "'seed' must be of type int, not True"),
+        ({"seed": "1"}, "'seed' must be of type int, not '1'"),
+        ({"ppo": {"mirror": 1}}, "'ppo.mirror' must be of type bool, not 1"),
+        ({"ppo": {"gamma": "0.9"}}, "'ppo.gamma' must be of type float, not '0.9'"),
+        ({"ppo": {"gamma": None}}, "'ppo.gamma' must be of type float, not None"),
+        ({"ppo": {"gamma": True}}, "'ppo.gamma' must be of type float, not True"),
+        ({"ppo": {"gamma": float("nan")}}, "'ppo.gamma' must be a finite number, not nan"),
+        ({"ppo": {"gamma": float("-inf")}}, "'ppo.gamma' must be a finite number, not -inf"),
+        ({"ppo": {"actor": 256}}, "'ppo.actor' must be a list, not 256"),
+        ({"ppo": {"actor": [256, 0.5]}}, "'ppo.actor' must be of type int, not 0.5"),
+        ({"ppo": {"activation": "gelu"}}, "'ppo.activation' must be one of elu, relu, tanh, not"),
+        ({"env": {"terrain": "tile"}}, "'env.terrain' must be one of plane, tiles, not 'tile'"),
+        ({"env": {"robot": {"urdf": 3}}}, "'env.robot.urdf' must be of type str, not 3"),
+        ({"env": {"robot": {"torque_limit": [1, 2]}}}, "torque_limit' must have 3 values, not 2"),
+        ({"env": {"commands": {"vx": [1, -1]}}}, r"must be \[low, high\] with low <= high"),
+        ({"env": {"commands": {"vx": [0, "1"]}}}, "'env.commands.vx' must be of type float, not"),
+        ({"env": {"commands": {"vx": [0, 1, 2]}}}, "'env.commands.vx' must have 2 values, not 3"),
+        ({"env": {"commands": {"vx": [0, float("inf")]}}}, "vx' must be a finite number, not inf"),
+    ],
+)
+def test_wrong_data_is_one_clear_line(data: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        from_dict(LowTrainConfig, data)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_range_may_be_one_point() -> None:
+    assert from_dict(CommandRanges, {"vx": [0.5, 0.5]}).vx == (0.5, 0.5)
+
+
+def test_front_and_rear_are_not_a_range() -> None:
+    assert from_dict(RobotConfig, {"nominal_thigh": [1.0, 0.8]}).nominal_thigh == (1.0, 0.8)
+
+
+def test_overrides() -> None:
+    config = with_overrides(
+        LowTrainConfig(),
+        [
+            "seed=7",
+            "env.robot.kp=25",
+            "env.commands.vx=[-0.5, 0.5]",
+            "env.terrain=tiles",
+            'env.families=["stair", "gap"]',
+            "ppo.mirror=false",
+            "ppo.learning_rate=1e-3",
+            "env.robot.urdf=a=b.urdf",
+        ],
+    )
+    assert config.seed == 7
+    assert config.env.robot.kp == 25.0
+    assert config.env.commands.vx == (-0.5, 0.5)
+    assert config.env.terrain == "tiles"
+    assert config.env.families == ("stair", "gap")
+    assert config.ppo.mirror is False
+    assert config.ppo.learning_rate == 0.001
+    assert config.env.robot.urdf == "a=b.urdf"
+    # Nothing else moved.
+    undone = with_overrides(
+        config,
+        [
+            "seed=42", "env.robot.kp=20.0", "env.commands.vx=[-1, 1]", "env.terrain=plane",
+            'env.families=["rough", "stair", "gap", "tilt"]', "ppo.mirror=true",
+            "ppo.learning_rate=5e-4", "env.robot.urdf=urdf/quadruped.urdf",
+        ],
+    )  # fmt: skip
+    assert undone == LowTrainConfig()
+
+
+def test_the_last_override_of_a_key_holds() -> None:
+    assert with_overrides(RobotConfig(), ["kp=1", "kp=2"]).kp == 2.0
+
+
+def test_an_override_of_a_whole_table() -> None:
+    config = with_overrides(LowLevelConfig(), ['robot={"kp": 30}'])
+    assert config.robot == RobotConfig(kp=30.0)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("env.robot.kp", "cannot read --set 'env.robot.kp'; write key=value"),
+        ("=5", "cannot read --set '=5'; write key=value"),
+        ("env.robot.kq=1", "unknown configuration key 'env.robot.kq'; allowed: urdf, kp"),
+        ("kp=1", "unknown configuration key 'kp'; allowed: seed"),
+        ("seed.x=1", "'seed.x': 'seed' is a value, it has no keys of its own"),
+        ("env..kp=1", "unknown configuration key 'env..kp'"),
+        ("seed=1.5", "'seed' must be of type int, not 1.5"),
+        ("env.robot.kp=NaN", "'env.robot.kp' must be a finite number, not nan"),
+        ("env.robot.kp=1e999", "'env.robot.kp' must be a finite number, not inf"),
+        ("env.robot.kp=twenty", "'env.robot.kp' must be of type float, not 'twenty'"),
+        ("env.robot.kp=", "'env.robot.kp' must be of type float, not ''"),
+        ("env.commands.vx=[1,0]", r"'env.commands.vx' must be \[low, high\] with low <= high"),
+        ("env=3", "env must be a table of keys, not 3"),
+        ('env={"robot": {"kq": 1}}', "unknown configuration key 'env.robot.kq'"),
+    ],
+)
+def test_wrong_overrides(assignment: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        with_overrides(LowTrainConfig(), [assignment])
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,251 @@
+"""The decision level: observation, rewards, curriculum order, tiles, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import tdgc  # noqa: F401  registers the environments
+from tdgc import rewards
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, HighRewardConfig
+from tdgc.high_env import (
+    PRETRAINED,
+    PROBES,
+    SEMANTIC,
+    NavigationTask,
+    check_pair,
+    high_layout,
+    load_low,
+)
+from tdgc.rewards import HighStep
+
+LOW = PRETRAINED / "low"
+
+
+def columns(cues: str) -> dict[str, slice]:
+    """Where each part of the observation stands."""
+    result, start = {}, 0
+    for name, size in high_layout(cues):
+        result[name] = slice(start, start + size)
+        start += size
+    return result
+
+
+@pytest.fixture
+def task():
+    task = NavigationTask(HighLevelConfig(), LOW, 5, seed=3, training=False)
+    task.reset(np.arange(5))
+    yield task
+    task.close()
+
+
+def step_of(**changes) -> HighStep:
+    """A robot standing at rest 4 m from the goal, facing it."""
+    zero3 = np.zeros((1, 3))
+    base = HighStep(
+        distance=np.array([4.0]),
+        heading_error=np.zeros(1),
+        time_share=np.array([0.25]),
+        lin_vel=zero3,
+        ang_vel=zero3,
+        joint_speed=np.zeros((1, 12)),
+        base_height=np.array([0.30]),
+        standing_height=0.30,
+        actions=np.zeros((2, 1, 13)),
+        commands=np.zeros((3, 1, 15)),
+        contact_forces=np.zeros((1, 5)),
+        config=HighRewardConfig(),
+    )
+    return dataclasses.replace(base, **changes)
+
+
+def test_goal_distance_is_the_papers_curve():
+    # R_map = 8, a = 1, b = 3: half way p = 0.5.
+    assert rewards.goal_distance(step_of())[0] == pytest.approx(0.5 + 1.0 - np.exp(-1.5))
+    assert rewards.goal_distance(step_of(distance=np.array([9.0])))[0] == 0.0
+    assert rewards.goal_distance(step_of(distance=np.array([0.0])))[0] == pytest.approx(
+        2.0 - np.exp(-3.0)
+    )
+
+
+def test_face_is_the_cosine():
+    assert rewards.face(step_of(heading_error=np.array([np.pi / 3])))[0] == pytest.approx(0.5)
+
+
+def test_arrival_pays_inside_the_radius_and_more_when_early():
+    assert rewards.arrive(step_of(distance=np.array([0.5])))[0] == 0.0
+    inside = step_of(distance=np.array([0.49]))
+    assert rewards.arrive(inside)[0] == pytest.approx(1.0 + 2.0 * 0.75)
+
+
+def test_stable_standing():
+    inside = step_of(distance=np.array([0.1]))
+    assert rewards.stable(inside)[0] == 1.0
+    moving = dataclasses.replace(
+        inside, lin_vel=np.array([[0.3, 0.4, 0.0]]), base_height=np.array([0.40])
+    )
+    assert rewards.stable(moving)[0] == pytest.approx(np.exp(-0.5) * np.exp(-1.0))
+    assert rewards.stable(step_of())[0] == 0.0
+
+
+def test_smoothness_terms():
+    actions = np.zeros((2, 1, 13))
+    actions[0, 0, :2] = [0.5, -0.5]
+    assert rewards.high_action_rate(step_of(actions=actions))[0] == pytest.approx(0.5)
+    commands = np.zeros((3, 1, 15))
+    commands[0], commands[1] = 0.3, 0.1
+    assert rewards.command_rate(step_of(commands=commands))[0] == pytest.approx(0.04)
+    assert rewards.command_acceleration(step_of(commands=commands))[0] == pytest.approx(0.01)
+
+
+def test_contact_force_beyond_the_threshold():
+    force = np.array([[41.0, 0.5, 3.0, 0.0, 0.0]])
+    assert rewards.contact_force(step_of(contact_forces=force))[0] == pytest.approx(42.0)
+
+
+def test_laziness_far_from_the_goal_only():
+    assert rewards.laziness(step_of())[0] == 1.0
+    assert rewards.laziness(step_of(lin_vel=np.array([[0.2, 0.0, 0.0]])))[0] == 0.0
+    assert rewards.laziness(step_of(distance=np.array([0.3])))[0] == 0.0
+
+
+def test_weights_are_scaled_by_the_steps_duration():
+    terms = rewards.high_terms(step_of(), dt=0.1)
+    assert terms["alive"][0] == pytest.approx(0.1 * HighRewardConfig().alive)
+    assert terms["laziness"][0] == pytest.approx(0.1 * HighRewardConfig().laziness)
+    off = step_of(config=dataclasses.replace(HighRewardConfig(), face=0.0))
+    assert "face" not in rewards.high_terms(off, dt=0.1)
+
+
+def test_layout_and_cues():
+    sizes = {cues: sum(n for _, n in high_layout(cues)) for cues in
+             ("none", "semantic", "geometric", "both")}  # fmt: skip
+    assert sizes == {"none": 48, "semantic": 54, "geometric": 80, "both": 86}
+    assert len(PROBES) == 32 and SEMANTIC[-1] == "unknown"
+
+
+def test_goal_is_seen_in_the_heading_frame(task):
+    where = columns("both")["goal"]
+    task.goal[:] = task.locomotion.world.state.position[:, :2] + [0.0, 2.0]  # due north
+    yaw = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2, 0.0])
+    xy = task.locomotion.world.state.position[:, :2].copy()
+    task.locomotion.place(np.arange(5), xy, yaw, np.zeros(5))
+    seen = task.observe()[:, where]
+    assert seen[:, 0] == pytest.approx(np.full(5, 0.25), abs=1e-6)
+    assert seen[:4, 1] == pytest.approx([0.0, 1.0, 0.0, -1.0], abs=1e-6)
+    assert seen[:4, 2] == pytest.approx([1.0, 0.0, -1.0, 0.0], abs=1e-6)
+
+
+def test_probes_see_what_is_ahead(task):
+    # Robot 1 looks at a wall that begins 0.4 m ahead of it.
+    state = task.locomotion.world.state
+    row = np.flatnonzero(PROBES[:, 0] > 0.45)
+    near = np.flatnonzero(PROBES[:, 0] < 0.35)
+    n = 161
+    x = state.position[1, 0] + 0.4
+    task.field.heights[n : 2 * n] = 0.0
+    task.field.heights[int(np.ceil(x / 0.05)) : 2 * n] = 0.3
+    xy = state.position[:, :2].copy()
+    task.locomotion.place(np.arange(5), xy, np.zeros(5), np.zeros(5))
+    probes = task.observe()[1, columns("both")["probes"]] * 0.5
+    standing = state.position[1, 2] - 0.30
+    assert probes[row] == pytest.approx(0.3 - standing, abs=1e-6)
+    assert probes[near] == pytest.approx(-standing, abs=1e-6)
+
+
+def test_family_is_one_hot(task):
+    family = task.observe()[:, columns("both")["family"]]
+    assert np.array_equal(family, np.eye(6)[:5])
+
+
+def test_a_decision_lasts_five_control_steps(task):
+    clock = task.locomotion.clock.clock.copy()
+    action = np.zeros((5, 13))
+    action[:, 4] = 1.0  # 4 Hz
+    task.step(action)
+    moved = np.mod(task.locomotion.clock.clock - clock, 1.0)
+    assert moved == pytest.approx(np.full(5, 4.0 * 0.1))
+    assert task.horizon == 200 and task.step_seconds == pytest.approx(0.1)
+
+
+def test_reaching_the_goal_counts_once_and_ends_after_the_hold(task):
+    task.goal[0] = task.locomotion.world.state.position[0, :2]
+    ends = []
+    for k in range(1, 23):
+        _, terminated, truncated = task.step(np.zeros((5, 13)))
+        if terminated[0] or truncated[0]:
+            ends.append((k, bool(truncated[0])))
+            break
+    assert task.reached[0] and not task.reached[1]
+    assert ends == [(21, True)]  # reached in decision 1, held for 20 more
+
+
+def test_curriculum_moves_levels_and_redraws_tiles():
+    config = HighLevelConfig(families=("stair",), window=2, threshold=2, episode_seconds=0.2)
+    task = NavigationTask(config, LOW, 2, seed=0)
+    try:
+        task.reset(np.arange(2))
+        for _ in range(2):  # two episodes of two decisions: robot 0 reaches, robot 1 does not
+            task.goal[0] = task.locomotion.world.state.position[0, :2]
+            task.goal[1] = task.locomotion.world.state.position[1, :2] + 3.0
+            for _ in range(2):
+                _, terminated, truncated = task.step(np.zeros((2, 13)))
+            assert truncated.all() and not terminated.any()
+            task.reset(np.arange(2))
+        assert task.curriculum.levels.tolist() == [1, 0]
+        n = 161
+        # d = 0.1: risers of 0.04 m, eight of them; d = 0: 0.03 m.
+        assert task.field.heights[:n].max() == pytest.approx(8 * 0.04)
+        assert task.field.heights[n:].max() == pytest.approx(8 * 0.03)
+    finally:
+        task.close()
+
+
+def test_restart_depends_on_the_state_alone():
+    config = HighLevelConfig(families=("rough", "gap"))
+    first = NavigationTask(config, LOW, 3, seed=1)
+    second = NavigationTask(config, LOW, 3, seed=1)
+    try:
+        first.reset(np.arange(3))
+        rng = np.random.default_rng(0)
+        for _ in range(2):
+            first.step(rng.uniform(-1, 1, (3, 13)))
+        second.load_state_dict(first.state_dict())
+        actions = rng.uniform(-1, 1, (2, 3, 13))
+        futures = []
+        for task in (first, second):
+            task.restart()
+            futures.append([task.step(a)[0] for a in actions] + [task.observe()])
+        for a, b in zip(*futures, strict=True):
+            assert np.array_equal(a, b)
+    finally:
+        first.close()
+        second.close()
+
+
+def test_bounds_outside_the_low_levels_training_are_refused():
+    _, low = load_low(LOW)
+    wide = HighLevelConfig(commands=dataclasses.replace(CommandRanges(), vx=(-1.0, 1.5)))
+    with pytest.raises(ConfigError, match=r"commands.vx asks for \[-1.0, 1.5\].*\[-1.0, 1.0\]"):
+        check_pair(wide, low)
+    narrow = HighLevelConfig(commands=dataclasses.replace(CommandRanges(), vx=(-0.5, 0.5)))
+    check_pair(narrow, low)
+
+
+def test_nan_action_is_refused(task):
+    with pytest.raises(ValueError, match="finite"):
+        task.step(np.full((5, 13), np.nan))
+
+
+def test_gymnasium_and_sb3_accept_it():
+    env = gym.make("tdgc/Navigation-v0")
+    try:
+        check_env(env.unwrapped, skip_render_check=True)
+        sb3_check_env(env.unwrapped)
+    finally:
+        env.close()

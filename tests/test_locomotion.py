@@ -1,0 +1,376 @@
+"""The executor: what the low level sees, in which frame and sign, and its left-right mirror."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pybullet
+import pytest
+
+from tdgc.commands import INDEX, observed_command
+from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
+from tdgc.gaits import gait_embedding
+from tdgc.locomotion import (
+    ACTOR_LAYOUT,
+    GYRO_LAYOUT,
+    MIRRORS,
+    SPEED_SCALE,
+    Locomotion,
+    action_mirror,
+    mirror_map,
+)
+from tdgc.low_env import CRITIC_LAYOUT, LowLevelTask
+from tdgc.robot import FOOT_RADIUS, Array, nominal_pose
+from tdgc.terrain import TILE_SIZE, Tile, make_tile
+
+ROBOT, PHYSICS = RobotConfig(), PhysicsConfig(substeps=4)
+NOMINAL = nominal_pose(ROBOT)
+
+
+#: A solver that stops early solves one side before the other; one that converges does not care.
+CONVERGED = PhysicsConfig(solver_iterations=300)
+
+
+def slices(layout: tuple[tuple[str, int], ...]) -> dict[str, slice]:
+    ends = np.cumsum([size for _, size in layout])
+    return {name: slice(end - size, end) for (name, size), end in zip(layout, ends, strict=True)}
+
+
+ACTOR = slices(ACTOR_LAYOUT + GYRO_LAYOUT)
+
+
+def standing(num: int = 1, gyro: bool = False, physics: PhysicsConfig = PHYSICS) -> Locomotion:
+    loco = Locomotion(num, ROBOT, physics, None, gyro)
+    index = np.arange(num)
+    loco.place(index, np.zeros((num, 2)), np.zeros(num), np.zeros(num))
+    return loco
+
+
+@pytest.fixture
+def loco() -> Iterator[Locomotion]:
+    """Two robots that stand, with a gyro."""
+    made = standing(2, gyro=True)
+    yield made
+    made.world.close()
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> Array:
+    return np.array(pybullet.getQuaternionFromEuler([roll, pitch, yaw]))
+
+
+# ------------------------------------------------------------------ observation
+
+
+def test_layout() -> None:
+    assert [f"{name} {size}" for name, size in ACTOR_LAYOUT] == [
+        "gravity 3", "joint_error 12", "joint_speed 12", "last_action 12", "action_before 12",
+        "command 15", "clock 4", "gait 1",
+    ]  # fmt: skip
+    assert sum(size for _, size in ACTOR_LAYOUT) == 71
+    without = standing()
+    assert without.layout == ACTOR_LAYOUT
+    assert without.observe().shape == (1, 71)
+    assert without.observe().dtype == np.float32
+    without.world.close()
+
+
+def test_observation_of_a_robot_that_stands(loco: Locomotion) -> None:
+    seen = loco.observe()
+    assert seen.shape == (2, 74)
+    assert loco.layout == ACTOR_LAYOUT + GYRO_LAYOUT
+    expected = np.zeros(74)
+    expected[2] = -1.0
+    expected[ACTOR["command"]] = observed_command(loco.command[0])
+    np.testing.assert_allclose(seen, np.stack([expected] * 2), atol=1e-7)
+
+
+def test_gravity_is_in_the_body_frame(loco: Locomotion) -> None:
+    """Nose down brings gravity to the front, left side up to the right, heading does nothing."""
+    state = loco.world.state
+    state.quaternion[0] = quaternion(0.0, 0.3, 2.0)
+    state.quaternion[1] = quaternion(0.2, 0.0, -1.0)
+    state.derive()
+    seen = loco.observe()[:, ACTOR["gravity"]]
+    assert seen[0, 0] > 0.0
+    np.testing.assert_allclose(seen[0], [math.sin(0.3), 0.0, -math.cos(0.3)], atol=1e-6)
+    np.testing.assert_allclose(seen[1], [0.0, -math.sin(0.2), -math.cos(0.2)], atol=1e-6)
+
+
+def test_a_robot_put_nose_down_in_bullet_has_gravity_ahead() -> None:
+    made = standing()
+    position = np.array([[0.0, 0.0, 1.0]])
+    made.world.reset_robots([0], position, quaternion(0.0, 0.4, 0.0)[None], NOMINAL[None])
+    nose = made.world.state.position[0] + made.world.state.rotation[0] @ [0.2, 0.0, 0.0]
+    assert nose[2] == pytest.approx(1.0 - 0.2 * math.sin(0.4), abs=1e-9)
+    made.act(np.zeros((1, 12)))  # in free fall
+    assert made.observe()[0, 0] == pytest.approx(math.sin(0.4), abs=0.02)
+    made.world.close()
+
+
+def test_joints_actions_and_gyro(loco: Locomotion) -> None:
+    state = loco.world.state
+    state.q[1] = NOMINAL + np.arange(12) / 10
+    state.qd[1] = np.arange(12)
+    loco.joint_offset[1] = 0.02
+    state.quaternion[1] = quaternion(math.pi / 2, 0.0, 0.0)
+    state.ang_vel[1] = [0.4, 0.8, 1.2]
+    state.derive()
+    loco.actions[0, 1], loco.actions[1, 1] = 0.5, -0.25
+    seen = loco.observe()[1]
+    np.testing.assert_allclose(seen[ACTOR["joint_error"]], np.arange(12) / 10 - 0.02, atol=1e-6)
+    np.testing.assert_allclose(seen[ACTOR["joint_speed"]], np.arange(12) * SPEED_SCALE, atol=1e-6)
+    assert SPEED_SCALE == 0.05
+    assert seen[ACTOR["last_action"]].tolist() == [0.5] * 12
+    assert seen[ACTOR["action_before"]].tolist() == [-0.25] * 12
+    # Rolled by a quarter turn, the world's z is the body's y and the world's y its -z.
+    np.testing.assert_allclose(seen[ACTOR["gyro"]], [0.1, 0.3, -0.2], atol=1e-6)
+
+
+def test_command_clock_and_gait(loco: Locomotion) -> None:
+    loco.clock.reset(np.arange(2), np.array([0.1, 0.25]))
+    loco.command[:, 12:] = gait_embedding([3, 2])
+    loco.command[1, INDEX["vx"]] = 0.7
+    seen = loco.observe()
+    sine = math.sin(0.2 * math.pi)
+    np.testing.assert_allclose(seen[0, ACTOR["clock"]], [-sine, -sine, sine, sine], atol=1e-6)
+    np.testing.assert_allclose(seen[1, ACTOR["clock"]], [-1.0, 1.0, -1.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(seen[:, ACTOR["gait"]], [[1.0], [2.0 / 3.0]], atol=1e-6)
+    wanted = observed_command(loco.command)
+    np.testing.assert_allclose(seen[:, ACTOR["command"]], wanted, atol=1e-6)
+
+
+def test_noise_is_on_measured_parts_only_and_within_its_width(loco: Locomotion) -> None:
+    quiet = loco.observe()
+    noise = RandomisationConfig(
+        noise_gravity=0.05, noise_joint_angle=0.01, noise_joint_speed=1.5
+    )
+    rng = np.random.default_rng(0)
+    error = np.array([loco.observe(noise, rng) - quiet for _ in range(200)])
+    widths = {"gravity": 0.05, "joint_error": 0.01, "joint_speed": 1.5 * SPEED_SCALE}
+    for name, where in ACTOR.items():
+        largest = np.abs(error[..., where]).max(axis=(0, 1))
+        width = widths.get(name, 0.0)
+        assert (largest <= width + 1e-6).all(), name
+        assert (largest >= 0.9 * width).all(), name
+        assert abs(error[..., where].mean()) <= 0.05 * width, name
+    off = dataclasses.replace(noise, scale=0.0)
+    assert (loco.observe(off, rng) == quiet).all()
+    assert (loco.observe() == quiet).all()
+
+
+# ------------------------------------------------------------------ acting
+
+
+def test_act_clips_and_keeps_histories(loco: Locomotion) -> None:
+    first, second = np.full((2, 12), 1.0), np.full((2, 12), -9.0)
+    loco.act(first)
+    loco.act(second)
+    assert (loco.actions[0] == -ROBOT.action_limit).all() and (loco.actions[1] == 1.0).all()
+    scale = np.tile([0.125, 0.25, 0.25], 4)
+    for age, action in enumerate([-6.0, 1.0, 0.0]):
+        expected = np.tile(NOMINAL + action * scale, (2, 1))
+        np.testing.assert_allclose(loco.targets[age], expected, atol=1e-12)
+    assert loco.clock.clock.tolist() == pytest.approx([0.12, 0.12])  # two steps at 3 Hz
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_not_finite(loco: Locomotion, value: float) -> None:
+    actions = np.zeros((2, 12))
+    actions[1, 5] = value
+    before = loco.observe()
+    with pytest.raises(ValueError, match="^an action must be finite; it has NaN or infinite"):
+        loco.act(actions)
+    assert (loco.observe() == before).all()
+
+
+def test_place_stands_robots_on_the_ground_and_forgets(loco: Locomotion) -> None:
+    for _ in range(3):
+        loco.act(np.ones((2, 12)))
+    other = loco.observe()[0]
+    loco.place(np.array([1]), np.array([[3.0, -2.0]]), np.array([1.2]), np.array([0.75]))
+    state = loco.world.state
+    np.testing.assert_allclose(state.foot_position[1, :, 2].min(), FOOT_RADIUS, atol=1e-12)
+    np.testing.assert_allclose(state.position[1, :2], [3.0, -2.0], atol=1e-12)
+    assert state.yaw[1] == pytest.approx(1.2)
+    assert (state.q[1] == NOMINAL).all() and (state.qd[1] == 0.0).all()
+    assert (state.lin_vel[1] == 0.0).all() and (state.foot_force[1] == 0.0).all()
+    assert (loco.actions[:, 1] == 0.0).all() and (loco.targets[:, 1] == NOMINAL).all()
+    assert loco.clock.clock[1] == 0.75
+    assert (loco.observe()[0] == other).all()
+    assert (loco.actions[:, 0] == 1.0).all()
+
+
+def draw_ten_times(
+    loco: Locomotion, config: RandomisationConfig, rng: np.random.Generator
+) -> list[Array]:
+    """Friction, payload, strength, latency and joint offset, the last draw last."""
+    draws = []
+    for _ in range(10):
+        loco.randomise(np.arange(loco.num_robots), config, rng)
+        values = (loco.friction, loco.payload, loco.world.strength, loco.delay, loco.joint_offset)
+        draws.append([value.copy() for value in values])
+    return [np.array(values) for values in zip(*draws, strict=True)]
+
+
+def test_randomise_draws_within_bounds_and_tells_bullet() -> None:
+    made = standing(11)
+    config, rng = RandomisationConfig(), np.random.default_rng(0)
+    draws = draw_ten_times(made, config, rng)
+    bounds = (config.friction, config.payload, config.motor_strength, config.latency)
+    for drawn, (low, high) in zip(draws, (*bounds, config.joint_offset), strict=True):
+        width = high - low
+        assert drawn.min() >= low and drawn.max() <= high
+        assert drawn.min() < low + 0.1 * width and drawn.max() > high - 0.1 * width
+    for i in (0, 10):  # one robot of each client
+        client, body = made.world._client_of[i], made.world._bodies[i]
+        trunk, calf = (client.getDynamicsInfo(body, link) for link in (-1, 2))
+        assert trunk[0] == pytest.approx(5.6 + made.payload[i], abs=1e-6)
+        assert trunk[1] == pytest.approx(made.friction[i], abs=1e-6)
+        assert calf[1] == pytest.approx(made.friction[i], abs=1e-6)
+        assert calf[0] == pytest.approx(0.2, abs=1e-9)
+    made.world.close()
+
+
+def test_randomise_with_scale_zero_and_width_zero_is_nominal() -> None:
+    made = standing(4)
+    rng = np.random.default_rng(0)
+    made.randomise(np.array([1]), RandomisationConfig(scale=0.0), rng)
+    made.randomise(np.array([2, 3]), RandomisationConfig(), rng, np.array([0.0, 1.0]))
+    assert made.friction[:3].tolist() == pytest.approx([0.8, 0.8, 0.8])
+    assert made.payload[:3].tolist() == made.delay[:3].tolist() == [0.0, 0.0, 0.0]
+    assert made.world.strength[:3, 0].tolist() == [1.0, 1.0, 1.0]
+    assert (made.joint_offset[:3] == 0.0).all()
+    assert made.payload[3] != 0.0 and made.joint_offset[3].std() > 0.0
+    made.world.close()
+
+
+def test_randomise_in_part_shrinks_ranges_about_the_nominal_value() -> None:
+    made = standing(11)
+    half = RandomisationConfig(scale=0.5, friction=(0.4, 1.2), payload=(-1.0, 3.0))
+    friction, payload, *_ = draw_ten_times(made, half, np.random.default_rng(1))
+    assert 0.6 <= friction.min() < 0.65 and 0.95 < friction.max() <= 1.0
+    assert -0.5 <= payload.min() < -0.3 and 1.3 < payload.max() <= 1.5
+    made.world.close()
+
+
+# ------------------------------------------------------------------ the mirror
+
+
+def mirrored(seen: Array, mirror: tuple[Array, Array]) -> Array:
+    index, sign = mirror
+    return np.asarray(sign * seen[..., index])
+
+
+def test_mirroring_twice_is_nothing() -> None:
+    task = LowLevelTask(LowLevelConfig(gyro=True), 1, seed=0)
+    for mirror, size in ((task.observation_mirror, task.obs_dim), (task.action_mirror, 12)):
+        x = np.random.default_rng(0).normal(size=(3, size))
+        assert mirrored(x, mirror).shape == x.shape
+        assert (mirrored(mirrored(x, mirror), mirror) == x).all()
+        assert not (mirrored(x, mirror) == x).all()
+    task.close()
+
+
+def test_action_mirror_swaps_legs_and_flips_hips() -> None:
+    x = np.arange(1.0, 13.0)
+    assert mirrored(x, action_mirror()).tolist() == [
+        -4.0, 5.0, 6.0, -1.0, 2.0, 3.0, -10.0, 11.0, 12.0, -7.0, 8.0, 9.0
+    ]  # fmt: skip
+    np.testing.assert_allclose(mirrored(NOMINAL, action_mirror()), NOMINAL, atol=0)
+
+
+def mirror_commands(loco: Locomotion, rng: np.random.Generator, gait: int) -> None:
+    """Commands for robot 0, their mirror image for robot 1, and clocks that fit: where left and
+    right are half a cycle apart, changing sides is waiting half a cycle."""
+    config = LowLevelConfig().commands
+    bounds = np.array(dataclasses.astuple(config))
+    loco.command[0, :12] = rng.uniform(bounds[:, 0], bounds[:, 1])
+    loco.command[0, 12:] = gait_embedding(gait)
+    loco.command[1] = loco.command[0]
+    loco.command[1, [INDEX["vy"], INDEX["yaw_rate"], INDEX["roll"]]] *= -1.0
+    clock = rng.uniform()
+    loco.clock.reset(np.arange(2), np.array([clock, clock + 0.5 * (gait in (0, 2))]) % 1.0)
+
+
+@pytest.mark.parametrize("gait", range(4))
+def test_a_mirrored_robot_sees_a_mirrored_world(gait: int) -> None:
+    """Two robots in Bullet, the second the first one's image: for 40 steps of random actions what
+    the second sees, the critic's part included, is the mirror image of what the first sees."""
+    config = LowLevelConfig(gyro=True, command_seconds=0.0, physics=CONVERGED)
+    task = LowLevelTask(config, 2, seed=0, training=False)
+    loco, rng = task.locomotion, np.random.default_rng(gait)
+    mirror_commands(loco, rng, gait)
+    yaw = rng.uniform(-1.0, 1.0)
+    xy = np.array([[0.3, 0.4], [0.3, -0.4]])
+    loco.place(np.arange(2), xy, np.array([yaw, -yaw]), loco.clock.clock.copy())
+    offset = rng.uniform(-0.02, 0.02, 12)
+    loco.joint_offset[:] = [offset, mirrored(offset, action_mirror())]
+    loco.world.push([0, 1], np.array([[0.2, 0.3, 0.0], [0.2, -0.3, 0.0]]))
+    rewards = []
+    for _ in range(40):
+        action = rng.normal(0.0, 1.0, 12)
+        reward, _, _ = task.step(np.stack([action, mirrored(action, task.action_mirror)]))
+        rewards.append(reward)
+        first, second = task.observe()
+        np.testing.assert_allclose(second, mirrored(first, task.observation_mirror), atol=5e-6)
+    np.testing.assert_allclose(np.array(rewards)[:, 1], np.array(rewards)[:, 0], atol=1e-7)
+    state = loco.world.state
+    moved = state.position[0] - [0.3, 0.4, 0.0]
+    assert np.linalg.norm(moved[:2]) > 0.005 and abs(state.gravity[0, 1]) > 0.01
+    np.testing.assert_allclose(state.position[1] * [1, -1, 1], state.position[0], atol=2e-6)
+    task.close()
+
+
+def slanted_stairs() -> tuple[Tile, Tile]:
+    """Stairs on a lateral slope, level in no direction, and their image about the middle line.
+
+    Every cell is plane, so the triangles that Bullet makes of it have no handedness.
+    """
+    tile = make_tile("stair", 0.3, np.random.default_rng(0))
+    y = np.linspace(-0.5, 0.5, tile.heights.shape[1]) * TILE_SIZE
+    heights = (tile.heights + 0.2 * y).astype(np.float32)
+    one = dataclasses.replace(tile, heights=heights, support=heights.copy())
+    back = heights[:, ::-1].copy()
+    return one, dataclasses.replace(one, heights=back, support=back.copy())
+
+
+def test_the_critic_sees_a_mirrored_terrain() -> None:
+    """The second robot's state is set to the image of the first one's, which walks on stairs."""
+    config = LowLevelConfig(terrain="tiles", families=("stair",), command_seconds=0.0)
+    task = LowLevelTask(config, 2, seed=0, training=False)
+    assert task.field is not None
+    for row, tile in enumerate(slanted_stairs()):
+        task.field.place(row, 0, tile)
+    loco, state = task.locomotion, task.locomotion.world.state
+    loco.world.upload_terrain()
+    loco.friction[:], loco.payload[:], loco.delay[:] = 0.6, 1.5, 0.012
+    rng = np.random.default_rng(5)
+    mirror_commands(loco, rng, gait=0)
+    origin = task.field.origin(np.arange(2), 0)
+    pitch, middle = origin[1, 0], origin[0, 1] + TILE_SIZE / 2
+    xy = np.array([[2.35, middle + 0.3], [2.35 + pitch, middle - 0.3]])
+    loco.place(np.arange(2), xy, np.array([0.4, -0.4]), loco.clock.clock.copy())
+    swap, flip = task.action_mirror
+    for _ in range(20):
+        loco.act(np.tile(rng.normal(0.0, 0.5, 12), (2, 1)))
+        loco.actions[:, 1] = mirrored(loco.actions[:, 0], (swap, flip))
+        state.position[1] = state.position[0] * [1, -1, 1] + [pitch, 2 * middle, 0.0]
+        state.quaternion[1] = state.quaternion[0] * [-1, 1, -1, 1]
+        state.lin_vel[1] = state.lin_vel[0] * [1, -1, 1]
+        state.ang_vel[1] = state.ang_vel[0] * [-1, 1, -1]
+        for joints in (state.q, state.qd):
+            joints[1] = mirrored(joints[0], (swap, flip))
+        state.foot_force[1] = state.foot_force[0, [1, 0, 3, 2]]
+        state.derive()
+        task._ground = task._measure_ground()
+        first, second = task.observe()
+        np.testing.assert_allclose(second, mirrored(first, task.observation_mirror), atol=1e-4)
+    critic, where = first[task.actor_dim :], slices(CRITIC_LAYOUT)
+    # What is compared is not all alike: the slope shows left to right, the stairs along x.
+    probes = critic[where["terrain"]].reshape(5, 3)
+    assert (probes[:, 0] - probes[:, 2] > 0.1).all() and np.ptp(probes[:, 1]) > 0.2
+    assert np.ptp(critic[where["foot_height"]]) > 0.01
+    dynamics = critic[where["dynamics"]].tolist()
+    assert dynamics == pytest.approx([0.6, 0.5, 0.0, 0.4])
+    task.close()

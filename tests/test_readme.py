@@ -1,0 +1,148 @@
+"""README is true: its commands and code run, its tables are what the code has."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import evaluate
+import train_low
+from tdgc.commands import CommandDecoder
+from tdgc.evaluation import CONDITIONS
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+BY_CI = None  # .ci/run runs the set-up and the tests as README has them
+TRAIN = "--steps 128 --n-envs 4 --workers 1"
+#: Each command of README -> what is added to make it short, or BY_CI. ``{tmp}`` is a folder that
+#: the commands share; they run in this order, which is README's.
+COMMANDS: dict[str, str | None] = {
+    "python3 -m venv .venv": BY_CI,
+    ".venv/bin/pip install -c constraints.txt -e .": BY_CI,
+    ".venv/bin/python train_low.py --time-limit 600": f"{TRAIN} --out {{tmp}}/first",
+    ".venv/bin/pip install -c constraints.txt -e '.[dev]'": BY_CI,
+    ".venv/bin/python -m pytest": BY_CI,
+    "python train_low.py": f"{TRAIN} --out {{tmp}}/low",
+    "python train_low.py --resume --time-limit 3600": "--steps 256 --out {tmp}/low",
+    "tensorboard --logdir runs": "--inspect --logdir {tmp}",
+    "python evaluate.py --low runs/low/policy --levels 6-10": (
+        "--low {tmp}/low/policy --levels 6 --families tilt --episodes 1 --workers 1 "
+        "--out {tmp}/evaluation"
+    ),
+    "python -m tdgc.bench --out runs/bench": (
+        "--robots 2 --workers 1 --seconds 0.1 --out {tmp}/bench"
+    ),
+}
+#: What is in ``{tmp}`` afterwards.
+OUTPUTS = (
+    "first/policy.safetensors",
+    "low/config.json",
+    "low/policy.json",
+    "low/policy.safetensors",
+    "low/checkpoints/step-000000000128",
+    "low/checkpoints/step-000000000256",
+    "low/tensorboard",
+    "evaluation/episodes.csv",
+    "evaluation/summary.json",
+    "evaluation/success.png",
+    "bench/bench.json",
+)
+PROGRAMS = {
+    "python": [sys.executable],
+    ".venv/bin/python": [sys.executable],
+    "tensorboard": [sys.executable, "-m", "tensorboard.main"],
+}
+
+
+def blocks(language: str) -> list[str]:
+    """README's fenced blocks of one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
+
+
+def commands() -> list[str]:
+    """README's shell commands in order, without comments, a chain taken apart."""
+    lines = "".join(blocks("bash")).replace("\\\n", " ").splitlines()
+    bare = [re.sub(r"(^|\s)#.*", "", line) for line in lines]
+    return [part.strip() for line in bare if line.strip() for part in line.split("&&")]
+
+
+def rows(heading: str) -> list[list[str]]:
+    """Cells of the table under a heading, without its two head lines."""
+    section = README.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def test_every_command_is_in_the_table() -> None:
+    assert list(dict.fromkeys(commands())) == list(COMMANDS)
+
+
+def test_commands_run(tmp_path: Path) -> None:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    for command, added in COMMANDS.items():
+        if added is BY_CI:
+            continue
+        program, *arguments = shlex.split(f"{command} {added.format(tmp=tmp_path)}")
+        result = subprocess.run(
+            [*PROGRAMS[program], *arguments],
+            cwd=ROOT,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=600,
+        )
+        output = (result.stdout + result.stderr)[-4000:]
+        assert result.returncode == 0, f"{command}\n{output}"
+    assert not [name for name in OUTPUTS if not (tmp_path / name).exists()]
+
+
+def test_ci_finds_the_test_command() -> None:
+    chains = [line for line in README.splitlines() if re.search("^python3 .* -m pytest$", line)]
+    assert len(chains) == 1
+
+
+@pytest.mark.parametrize("code", blocks("python"))
+def test_python_runs(code: str) -> None:
+    exec(compile(code, "README.md", "exec"), {})
+
+
+def test_table_of_commands_is_the_decoders() -> None:
+    decoder = CommandDecoder()
+    bounds = zip(decoder.low, decoder.high, strict=True)
+    expected = [
+        [name, unit, f"{low:g} {'to' if i < 12 else 'or'} {high:g}"]
+        for i, (name, unit, (low, high)) in enumerate(
+            zip(decoder.names, decoder.units, bounds, strict=True)
+        )
+    ]
+    assert [row[:3] for row in rows("What it is")] == expected
+
+
+@pytest.mark.parametrize(
+    ("heading", "main"), [("Train", train_low.main), ("Evaluate", evaluate.main)]
+)
+def test_table_of_flags_is_the_scripts(
+    heading: str, main: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    flags = re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, flags=re.MULTILINE)
+    assert [row[0] for row in rows(heading)] == flags
+
+
+def test_conditions_are_named() -> None:
+    assert not [name for name in CONDITIONS if f"`{name}`" not in README]
+
+
+def test_map_names_what_is_there() -> None:
+    named = {row[0] for row in rows("Repository map")}
+    assert not [name for name in named if not (ROOT / name).exists()]
+    modules = [*ROOT.glob("*.py"), *(ROOT / "tdgc").glob("[a-z]*.py")]
+    assert not {str(path.relative_to(ROOT)) for path in modules} - named

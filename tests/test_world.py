@@ -1,0 +1,491 @@
+"""Bullet worlds: the ground is where numpy says, robots weigh and act alone, nothing leaks."""
+
+import hashlib
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pytest
+
+from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.robot import (
+    FOOT_RADIUS,
+    TRUNK_MASS,
+    Array,
+    foot_kinematics,
+    nominal_pose,
+    yaw_quaternion,
+)
+from tdgc.terrain import ALL_FAMILIES, HEIGHT_RANGE, TileField, make_tile, tile_rng
+from tdgc.world import CLIENT_ROBOTS, World
+
+ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()
+NOMINAL = nominal_pose(ROBOT)
+MASS = 12.6  # kg
+G = 9.81
+#: Trunk above the soles in the nominal pose, m.
+STAND = FOOT_RADIUS - foot_kinematics(NOMINAL[None], np.zeros((1, 12)))[0][0, :, 2].min()
+UPSIDE_DOWN = np.array([[1.0, 0.0, 0.0, 0.0]])
+
+
+def put(world: World, xy: Array, height: float = STAND, yaw: float = 0.0) -> None:
+    """All robots at ``xy`` (M, 2), their trunks ``height`` above z = 0."""
+    m = world.num_robots
+    position = np.column_stack([np.broadcast_to(xy, (m, 2)), np.full(m, height)])
+    quaternion = yaw_quaternion(np.full(m, yaw))
+    world.reset_robots(np.arange(m), position, quaternion, np.tile(NOMINAL, (m, 1)))
+
+
+def hold(world: World, steps: int = 1, targets: Array | None = None) -> None:
+    """Control steps without delay or offset, by default at the nominal pose."""
+    m = world.num_robots
+    wanted = np.broadcast_to(NOMINAL if targets is None else targets, (3, m, 12))
+    for _ in range(steps):
+        world.step(wanted, np.zeros(m), np.zeros((m, 12)))
+
+
+def snapshot(world: World) -> Array:
+    """(M, n) everything that was measured."""
+    s = world.state
+    flat = [s.position, s.quaternion, s.lin_vel, s.ang_vel, s.q, s.qd, s.torque]
+    return np.column_stack([*flat, s.foot_force, s.leg_force, s.trunk_force])
+
+
+@pytest.fixture
+def plane() -> Iterator[World]:
+    """One robot that stands on a plane."""
+    world = World(1, ROBOT, PHYSICS)
+    put(world, np.zeros(2))
+    yield world
+    world.close()
+
+
+def tiles(families: list[str], level: int = 10, crop: float = 2.0, seed: int = 0) -> TileField:
+    """A field with a row a robot."""
+    field = TileField((len(families), 1), crop=crop)
+    for i, family in enumerate(families):
+        field.place(i, 0, make_tile(family, level / 10, tile_rng(seed, family, level, i)))
+    return field
+
+
+# ------------------------------------------------------------------ the ground
+
+
+def assert_rays_hit_the_field(world: World, seed: int) -> None:
+    """Rays straight down, each in the client that holds the robot's row."""
+    field, rng = world.field, np.random.default_rng(seed)
+    assert field is not None
+    for row in range(world.num_robots):
+        local = rng.uniform([0.001, field.crop + 0.001], [7.999, 7.999 - field.crop], (200, 2))
+        xy = local + field.origin(row, 0)
+        heights = field.height_at(xy[:, 0], xy[:, 1])
+        ends = np.full((200, 1), 3.0)
+        client = world._client_of[row]
+        client.setCollisionFilterGroupMask(client.ground, -1, 1, -1)  # rays are not robots
+        hits = client.rayTestBatch(np.hstack([xy, ends]).tolist(), np.hstack([xy, -ends]).tolist())
+        assert {hit[0] for hit in hits} == {client.ground}
+        client.setCollisionFilterGroupMask(client.ground, -1, 1, 2)
+        np.testing.assert_allclose([hit[3][2] for hit in hits], heights, atol=1e-4)
+        assert (world.ground_height(xy[:, 0], xy[:, 1]) == heights).all()
+
+
+def test_heightfield_is_where_numpy_says() -> None:
+    """Two tiles in one client, of families that are not symmetric in any way."""
+    world = World(2, ROBOT, PHYSICS, tiles(["rough", "pillar"], crop=0.0))
+    assert len(world._clients) == 1
+    assert_rays_hit_the_field(world, 0)
+    world.close()
+
+
+def test_heightfield_of_several_clients_and_after_a_redraw() -> None:
+    families = ["rough", "pillar", "stair", "gap", "tilt", "mixed"]
+    world = World(12, ROBOT, PHYSICS, tiles(families * 2))
+    field = world.field
+    assert field is not None and CLIENT_ROBOTS < 12
+    assert [client.first_row for client in world._clients] == [0, 6]
+    assert_rays_hit_the_field(world, 1)
+    for row, family in enumerate(reversed(families * 2)):
+        field.place(row, 0, make_tile(family, 0.8, np.random.default_rng(row)))
+    world.upload_terrain()
+    assert_rays_hit_the_field(world, 2)
+    # One tile of the second client.
+    before = field.heights.copy()
+    field.place(7, 0, make_tile("tilt", 1.2, np.random.default_rng(99)))
+    assert (field.heights != before).any()
+    world.upload_terrain([7])
+    assert_rays_hit_the_field(world, 3)
+    world.close()
+
+
+def test_a_robot_stands_on_its_own_tile_in_every_client() -> None:
+    """Eleven flat tiles, each at another height."""
+    ground = np.linspace(-0.5, 0.5, 11)
+    field = TileField((11, 1), crop=2.9)
+    field.heights += np.repeat(ground, 161)[:, None].astype(np.float32)
+    world = World(11, ROBOT, PHYSICS, field)
+    position = np.column_stack([field.origin(np.arange(11), 0) + [0.75, 4.0], ground + STAND])
+    upright = yaw_quaternion(np.zeros(11))
+    world.reset_robots(np.arange(11), position, upright, np.tile(NOMINAL, (11, 1)))
+    hold(world, 50)
+    np.testing.assert_allclose(world.state.position[:, 2] - ground, 0.28, atol=0.01)
+    assert (world.state.foot_force > 1.0).all()
+    world.close()
+
+
+def test_ground_of_a_plane_and_support_of_tiles(plane: World) -> None:
+    x = np.array([[0.0, 5.0], [-3.0, 1.0]])
+    assert (plane.ground_height(x, x) == 0.0).all() and (plane.support_height(x, x) == 0.0).all()
+    field = tiles(["gap", "pillar"], crop=0.0)
+    world = World(2, ROBOT, PHYSICS, field)
+    for row, extreme in ((0, -0.6), (1, 0.8)):
+        part = field.heights[row * 161 : (row + 1) * 161]
+        ix, iy = np.argwhere(np.isclose(part, extreme))[0]
+        at = field.origin(row, 0) + np.array([ix, iy]) * field.cell
+        assert world.ground_height(at[0], at[1]) == pytest.approx(extreme, abs=1e-4)
+        assert world.support_height(at[0], at[1]) == pytest.approx(0.0, abs=1e-9)
+    world.close()
+
+
+def test_fields_that_do_not_fit() -> None:
+    with pytest.raises(ValueError, match=r"^3 robots need as many tile rows, not 2$"):
+        World(3, ROBOT, PHYSICS, TileField((2, 1)))
+    with pytest.raises(ValueError, match="^Bullet holds 2097152 samples a field, not 2332890$"):
+        World(10, ROBOT, PHYSICS, TileField((10, 9)))
+    field = TileField((1, 1), crop=2.9)
+    field.heights[5, 5] = HEIGHT_RANGE[1] + 0.01
+    with pytest.raises(ValueError, match=r"^heights 0\.00\.\.2\.11 m leave \(-2\.1, 2\.1\) m$"):
+        World(1, ROBOT, PHYSICS, field)
+    field.heights[5, 5] = 0.0
+    world = World(1, ROBOT, PHYSICS, field)
+    field.heights[5, 5] = -2.2
+    with pytest.raises(ValueError, match="^heights -2.20"):
+        world.upload_terrain()
+    world.close()
+
+
+def test_a_urdf_without_the_joints(tmp_path: Path) -> None:
+    urdf = tmp_path / "box.urdf"
+    urdf.write_text('<robot name="box"><link name="trunk"/></robot>', encoding="utf-8")
+    with pytest.raises(ValueError, match="lacks the joints FL_hip_joint, FL_thigh_joint"):
+        World(1, RobotConfig(urdf=str(urdf)), PHYSICS)
+
+
+def resident() -> float:
+    """MB of memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def test_a_thousand_redraws_leak_nothing() -> None:
+    field = TileField((1, 1), crop=2.5)
+    world = World(1, ROBOT, PHYSICS, field)
+    drawn = [make_tile(family, 1.0, np.random.default_rng(0)) for family in ALL_FAMILIES]
+    for k in range(20):
+        field.place(0, 0, drawn[k % 6])
+        world.upload_terrain()
+    before = resident()
+    for k in range(1000):
+        field.place(0, 0, drawn[k % 6])
+        world.upload_terrain()
+    assert resident() - before < 20.0
+    assert_rays_hit_the_field(world, 4)
+    world.close()
+
+
+# ------------------------------------------------------------------ one robot
+
+
+def test_free_fall_and_state_of_the_last_step(plane: World) -> None:
+    put(plane, np.array([1.0, 2.0]), height=5.0, yaw=0.5)
+    hold(plane, 5)
+    state, n, dt = plane.state, 40, PHYSICS.dt
+    assert state.lin_vel[0].tolist() == pytest.approx([0.0, 0.0, -G * n * dt], abs=1e-9)
+    # Bullet moves with the new speed: the sum of 1..n of g dt^2.
+    fallen = G * dt * dt * n * (n + 1) / 2
+    assert state.position[0].tolist() == pytest.approx([1.0, 2.0, 5.0 - fallen], abs=1e-9)
+    np.testing.assert_allclose(state.q[0], NOMINAL, atol=1e-9)
+    assert state.yaw[0] == pytest.approx(0.5, abs=1e-9)
+    assert (state.foot_force == 0.0).all() and state.trunk_force[0] == 0.0
+
+
+def mean_foot_force(world: World, steps: int = 25) -> Array:
+    """(M, 4) N."""
+    total = np.zeros((world.num_robots, 4))
+    for _ in range(steps):
+        hold(world)
+        total += world.state.foot_force
+    return total / steps
+
+
+def test_a_standing_robot_presses_with_its_weight(plane: World) -> None:
+    hold(plane, 200)  # it sways on its soft joints for a while
+    force = mean_foot_force(plane)[0]
+    assert force.sum() == pytest.approx(MASS * G, rel=0.01)
+    assert (force > 0.15 * MASS * G).all()
+    state = plane.state
+    assert (state.leg_force == 0.0).all() and state.trunk_force[0] == 0.0
+    assert state.position[0, 2] == pytest.approx(0.28, abs=0.02)
+    assert np.abs(state.lin_vel).max() < 0.02 and np.abs(state.gravity[0, :2]).max() < 0.05
+    # Static: what the motors give is what the load asks for.
+    limit = np.tile(ROBOT.torque_limit, 4)
+    assert (np.abs(state.torque[0]) < 0.5 * limit).all() and np.abs(state.torque[0]).max() > 3.0
+
+
+@pytest.mark.parametrize("payload", [-1.0, 3.0])
+def test_payload_adds_its_weight(plane: World, payload: float) -> None:
+    plane.set_dynamics([0], np.array([0.8]), np.array([payload]))
+    hold(plane, 50)
+    assert mean_foot_force(plane)[0].sum() == pytest.approx((MASS + payload) * G, rel=0.01)
+    mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
+    assert mass == pytest.approx(TRUNK_MASS + payload)
+    nominal = np.array([0.016147, 0.068159, 0.073013])
+    np.testing.assert_allclose(inertia, nominal * mass / TRUNK_MASS, rtol=1e-6)
+    # Not on top of the last payload.
+    plane.set_dynamics([0], np.array([0.8]), np.array([0.0]))
+    mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
+    assert mass == pytest.approx(TRUNK_MASS)
+    np.testing.assert_allclose(inertia, nominal, rtol=1e-6)
+
+
+@pytest.mark.parametrize("friction", [0.4, 0.8])
+def test_friction_slows_a_sliding_robot(plane: World, friction: float) -> None:
+    """On its back and pushed at 1 m/s, the robot loses mu g of its speed each second."""
+    plane.set_dynamics([0], np.array([friction]), np.array([0.0]))
+    plane.reset_robots([0], np.array([[0.0, 0.0, 0.056]]), UPSIDE_DOWN, NOMINAL[None])
+    hold(plane, 15)
+    assert np.linalg.norm(plane.state.lin_vel[0]) < 0.05
+    plane.push([0], np.array([[0.0, 1.0, 0.0]]))
+    seconds = 0.08
+    hold(plane, 4)
+    assert plane.state.lin_vel[0, 1] == pytest.approx(1.0 - friction * G * seconds, abs=0.08)
+
+
+def test_a_dropped_robot_lands_on_its_feet(plane: World) -> None:
+    put(plane, np.zeros(2), STAND + 0.1)
+    largest = 0.0
+    for _ in range(50):
+        hold(plane)
+        largest = max(largest, float(plane.state.foot_force.sum()))
+        assert plane.state.trunk_force[0] == 0.0
+    assert largest > 2 * MASS * G
+    assert (plane.state.foot_force[0] > 1.0).all()
+    assert plane.state.foot_position[0, :, 2].tolist() == pytest.approx([FOOT_RADIUS] * 4, abs=2e-3)
+
+
+def test_a_robot_dropped_on_its_back_hits_with_its_trunk(plane: World) -> None:
+    plane.reset_robots([0], np.array([[0.0, 0.0, 0.30]]), UPSIDE_DOWN, NOMINAL[None])
+    assert plane.state.gravity[0].tolist() == [0.0, 0.0, 1.0]
+    largest = 0.0
+    for _ in range(25):
+        hold(plane)
+        largest = max(largest, plane.state.trunk_force[0])
+    assert largest > 40.0
+    assert plane.state.trunk_force[0] == pytest.approx(MASS * G, rel=0.5)
+    assert (plane.state.foot_force == 0.0).all()
+
+
+def test_a_robot_on_its_knees_presses_with_its_legs(plane: World) -> None:
+    """Calves folded up: the knees carry, and no foot is blamed for it."""
+    folded = np.tile([0.0, 0.0, -2.7], 4)
+    upright = yaw_quaternion(np.zeros(1))
+    plane.reset_robots([0], np.array([[0.0, 0.0, 0.236]]), upright, folded[None])
+    hold(plane, 10, folded)
+    assert (plane.state.leg_force[0] > 0.0).any()
+    assert plane.state.foot_force[0].sum() == 0.0
+
+
+def test_push_adds_a_velocity() -> None:
+    world = World(2, ROBOT, PHYSICS)
+    put(world, np.array([[0.0, 0.0], [3.0, 0.0]]), height=5.0)
+    hold(world)
+    before = world.state.lin_vel.copy()
+    world.push([1], np.array([[0.4, -0.3, 0.1]]))
+    linear, angular = world._client_of[1].getBaseVelocity(world._bodies[1])
+    np.testing.assert_allclose(linear, before[1] + [0.4, -0.3, 0.1], atol=1e-12)
+    np.testing.assert_allclose(angular, 0.0, atol=1e-12)
+    hold(world)
+    change = world.state.lin_vel - before - [0.0, 0.0, -G * 0.02]
+    np.testing.assert_allclose(change, [[0.0, 0.0, 0.0], [0.4, -0.3, 0.1]], atol=1e-6)
+    world.close()
+
+
+def test_motor_strength_scales_torque() -> None:
+    world = World(2, ROBOT, PHYSICS)
+    put(world, np.array([[0.0, 0.0], [3.0, 0.0]]), height=5.0)
+    world.strength[1] = 0.5
+    world.physics = PhysicsConfig(control_dt=0.0025, substeps=1)  # the first physics step alone
+    hold(world, 1, NOMINAL + 0.2)
+    np.testing.assert_allclose(world.state.torque[0], 4.0, atol=1e-9)  # 20 N m/rad
+    np.testing.assert_allclose(world.state.torque[1], 2.0, atol=1e-9)
+    world.close()
+
+
+def test_joints_keep_their_speed_limits_in_the_air(plane: World) -> None:
+    """Legs thrown from end to end of their range."""
+    put(plane, np.zeros(2), height=20.0)
+    fastest = np.zeros(12)
+    for k in range(40):
+        hold(plane, 1, NOMINAL + (1.5 if k // 6 % 2 else -1.5))
+        fastest = np.maximum(fastest, np.abs(plane.state.qd[0]))
+    assert fastest.max() <= 30.0 + 1e-6
+    assert fastest.max() > 12.0
+
+
+def test_joint_offset_shifts_where_the_motors_pull(plane: World) -> None:
+    put(plane, np.zeros(2), height=20.0)
+    offset = np.full((1, 12), 0.02)
+    for _ in range(30):
+        plane.step(np.tile(NOMINAL, (3, 1, 1)), np.zeros(1), offset)
+    np.testing.assert_allclose(plane.state.q[0], NOMINAL + 0.02, atol=1e-3)
+
+
+# ------------------------------------------------------------------ latency
+
+
+def drive(delay: float, late: int, steps: int = 12) -> Array:
+    """(steps, n) of a robot on a plane with random targets, shifted ``late`` control steps."""
+    world = World(1, ROBOT, PHYSICS)
+    put(world, np.zeros(2))
+    drawn = np.random.default_rng(0).uniform(-0.5, 0.5, (steps, 12)) + NOMINAL
+    sequence = np.concatenate([np.tile(NOMINAL, (4, 1)), drawn])
+    rows = []
+    for k in range(steps):
+        now = k + 4 - late
+        targets = sequence[[now, now - 1, now - 2]][:, None]
+        world.step(targets, np.array([delay]), np.zeros((1, 12)))
+        rows.append(snapshot(world)[0])
+    world.close()
+    return np.array(rows)
+
+
+def test_a_delay_of_a_control_step_is_a_target_a_step_older() -> None:
+    np.testing.assert_array_equal(drive(0.02, 0), drive(0.0, 1))
+    np.testing.assert_array_equal(drive(0.04, 0), drive(0.0, 2))
+    assert (drive(0.0, 0)[1] != drive(0.0, 1)[1]).any()
+
+
+def test_a_delay_within_a_control_step() -> None:
+    """10 ms: the first four of eight physics steps still act on the older target."""
+    world = World(1, ROBOT, PhysicsConfig(control_dt=0.02, substeps=8))
+    put(world, np.zeros(2), height=5.0)
+    old, new = NOMINAL, NOMINAL + 0.3
+    world.step(np.stack([new, old, old])[:, None], np.array([0.010]), np.zeros((1, 12)))
+    late = snapshot(world)
+    other = World(1, ROBOT, PhysicsConfig(control_dt=0.01, substeps=4))
+    put(other, np.zeros(2), height=5.0)
+    hold(other, 1, old)
+    hold(other, 1, new)
+    np.testing.assert_array_equal(late, snapshot(other))
+    world.close()
+    other.close()
+
+
+# ------------------------------------------------------------------ many robots
+
+
+def test_robots_do_not_touch_each_other() -> None:
+    """Two robots on one spot stand exactly as one does."""
+    both, alone = World(2, ROBOT, PHYSICS), World(1, ROBOT, PHYSICS)
+    for world in (both, alone):
+        put(world, np.zeros(2))
+        hold(world, 30)
+    client = both._client_of[0]
+    assert not client.getContactPoints(*both._bodies)
+    assert client.getContactPoints(client.ground, both._bodies[0])
+    np.testing.assert_array_equal(snapshot(both), np.tile(snapshot(alone), (2, 1)))
+    both.close()
+    alone.close()
+
+
+def trajectory(
+    world: World, robot: int, others: float = 1.0, steps: int = 40, seed: int = 0
+) -> Array:
+    """(steps, n) of one robot under random targets; the others' targets are scaled."""
+    m, rng = world.num_robots, np.random.default_rng(seed)
+    xy = np.column_stack([0.75 + 0.0 * np.arange(m), 0.5 * np.arange(m)])
+    if world.field is not None:
+        xy = world.field.origin(np.arange(m), 0) + np.array([3.0, 4.0])
+    height = world.ground_height(xy[:, 0], xy[:, 1]).max() + STAND + 0.05
+    put(world, xy, float(height), yaw=0.3)
+    world.push(np.arange(m), np.tile([0.3, 0.1, 0.0], (m, 1)))
+    history, rows = [np.tile(NOMINAL, (m, 1))] * 3, []
+    for _ in range(steps):
+        change = rng.uniform(-0.6, 0.6, 12)
+        targets = NOMINAL + np.where(np.arange(m)[:, None] == robot, 1.0, others) * change
+        history = [targets, *history[:2]]
+        world.step(np.array(history), np.linspace(0.0, 0.03, m), np.zeros((m, 12)))
+        rows.append(snapshot(world)[robot])
+    world.close()
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("robots", [5, 11])
+def test_a_robot_does_not_depend_on_the_others(robots: int) -> None:
+    """The last of 5 in a client, and the last of 11 in two."""
+    one = trajectory(World(robots, ROBOT, PHYSICS), robots - 1)
+    np.testing.assert_array_equal(
+        trajectory(World(robots, ROBOT, PHYSICS), robots - 1, others=-0.5), one
+    )
+
+
+def test_a_robot_alone_moves_as_among_others() -> None:
+    among = trajectory(World(4, ROBOT, PHYSICS), 0)
+    np.testing.assert_array_equal(trajectory(World(1, ROBOT, PHYSICS), 0), among)
+    assert np.ptp(among[:, :2], axis=0).max() > 0.02
+
+
+def test_a_robot_on_terrain_does_not_depend_on_the_others() -> None:
+    families = ["stair", "rough", "rough"]
+    one = trajectory(World(3, ROBOT, PHYSICS, tiles(families)), 2)
+    other = trajectory(World(3, ROBOT, PHYSICS, tiles(families)), 2, others=-0.5)
+    np.testing.assert_array_equal(other, one)
+
+
+def test_retired_robots_are_gone_and_the_others_go_on() -> None:
+    worlds = [World(3, ROBOT, PHYSICS) for _ in range(2)]
+    for world in worlds:
+        put(world, np.array([[0.0, 0.0], [0.0, 2.0], [0.0, 4.0]]), STAND + 0.02)
+        hold(world, 5)
+    worlds[0].retire([1])
+    frozen = snapshot(worlds[0])[1]
+    for world in worlds:
+        hold(world, 10, NOMINAL + 0.1)
+    first, second = (snapshot(world) for world in worlds)
+    np.testing.assert_array_equal(first[[0, 2]], second[[0, 2]])
+    np.testing.assert_array_equal(first[1, :37], frozen[:37])
+    assert (second[1] != frozen).any()
+    for world in worlds:
+        world.close()
+
+
+def fingerprint() -> str:
+    """Hash of a trajectory on terrain."""
+    rows = trajectory(World(2, ROBOT, PHYSICS, tiles(["rough", "stair"])), 1)
+    return hashlib.sha256(rows.tobytes()).hexdigest()
+
+
+def test_the_same_seed_gives_the_same_bits_here_and_in_another_process() -> None:
+    first = fingerprint()
+    assert fingerprint() == first
+    there = subprocess.run(
+        [sys.executable, "-c", "import test_world; print(test_world.fingerprint())"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(["tests", "."])},
+        cwd=Path(__file__).resolve().parents[1], capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert there.stdout.split()[-1] == first
+
+
+def test_bullet_time_is_counted_and_clients_are_closed() -> None:
+    world = World(11, ROBOT, PHYSICS)
+    assert world.bullet_seconds == 0.0
+    hold(world)
+    assert world.bullet_seconds > 0.0
+    ids = [client.id for client in world._clients]
+    assert len(ids) == 2 and all(pybullet.isConnected(i) for i in ids)
+    world.close()
+    assert not any(pybullet.isConnected(i) for i in ids)
