@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Evaluate the shipped policies on TDGC-Bench: a table, episodes.csv, summary.json and figures.
 
-    python evaluate.py --levels 6-10
-    python evaluate.py --tracking
-    python evaluate.py --policies gp --families stair,gap --levels 8 --episodes 20 --out runs/eval
+python evaluate.py --levels 6-10
+python evaluate.py --tracking
+python evaluate.py --policies gp --families stair,gap --levels 8 --episodes 20 --out runs/eval
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def choose(text: str, allowed: tuple[str, ...], everything: tuple[str, ...], what: str) -> list[str]:
+def choose(
+    text: str, allowed: tuple[str, ...], everything: tuple[str, ...], what: str
+) -> list[str]:
     """The names in a comma-separated flag; ``all`` stands for ``everything``."""
     names = list(everything) if text == "all" else text.split(",")
     for name in names:

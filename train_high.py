@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Train the recurrent high level on top of a frozen low level, level by level.
 
-    python train_high.py                       the whole job, on the shipped low level
-    python train_high.py --low runs/low/policy
-    python train_high.py --resume --out runs/high
+python train_high.py                       the whole job, on the shipped low level
+python train_high.py --low runs/low/policy
+python train_high.py --resume --out runs/high
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Train the gait-conditioned low level: first on the plane, then on rising terrain.
 
-    python train_low.py                        the whole job
-    python train_low.py --time-limit 3600      an hour of it
-    python train_low.py --resume --out runs/low
+python train_low.py                        the whole job
+python train_low.py --time-limit 3600      an hour of it
+python train_low.py --resume --out runs/low
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
     ]
 
 
-def build(config: LowTrainConfig, env_config: LowLevelConfig, device: str) -> tuple[PPO, TaskVecEnv]:
+def build(
+    config: LowTrainConfig, env_config: LowLevelConfig, device: str
+) -> tuple[PPO, TaskVecEnv]:
     """Workers and learner of one phase."""
     probe = LowLevelTask(dataclasses.replace(env_config, terrain="plane"), 1, seed=0)
     env = TaskVecEnv(

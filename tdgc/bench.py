@@ -43,9 +43,7 @@ def memory_mb(pids: list[int]) -> float:
     return total
 
 
-def measure(
-    config: LowLevelConfig, robots: int, workers: int, seconds: float
-) -> dict[str, float]:
+def measure(config: LowLevelConfig, robots: int, workers: int, seconds: float) -> dict[str, float]:
     """Collect for about ``seconds``: steps_per_s, bullet_share, mb_per_robot, mb_total.
 
     ``bullet_share`` is the time the workers spent inside Bullet's step over the time they spent
@@ -93,8 +91,9 @@ def main(arguments: list[str] | None = None) -> int:
     result: dict[str, dict[str, dict[str, float]]] = {}
     print("ground   workers   steps/s   in Bullet   MB/robot   MB")
     for ground in ("plane", "terrain"):
-        terrain = "plane" if ground == "plane" else "tiles"
-        config = dataclasses.replace(LowLevelConfig(), terrain=terrain, families=families)
+        config = LowLevelConfig(
+            terrain="plane" if ground == "plane" else "tiles", families=families
+        )
         for name, workers in (("1", 1), ("all", args.workers)):
             row = measure(config, args.robots, workers, args.seconds)
             result.setdefault(ground, {})[name] = row

@@ -39,6 +39,7 @@ NUM_COMMANDS = len(NAMES)
 #: Position of each command in the vector, by name.
 INDEX = {name: i for i, name in enumerate(NAMES)}
 
+
 def default_command() -> NDArray[np.float64]:
     """Standing still in trot with middling behaviour parameters, (15,).
 

@@ -355,7 +355,7 @@ def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:
 _TRACKING_SECONDS = 10.0  # an episode: one command
 _SETTLE_SECONDS = 1.0  # not counted: speeding up from rest
 _SWITCH_SECONDS = 2.0  # between gaits in the falls test
-_FALL_ROBOTS, _FALL_SECONDS = 60, 20.0  # 20 minutes of walking
+_FALL_SHARE, _FALL_SECONDS = 0.6, 20.0  # of the episodes: 100 a gait make 20 minutes of walking
 
 
 def _commands(rng: np.random.Generator, ranges: CommandRanges, n: int) -> Array:
@@ -369,7 +369,7 @@ def _walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[L
     loco = Locomotion(m, config.robot, config.physics, None, config.gyro)
     rows = np.arange(m)
     rng = np.random.default_rng(seed)
-    spots = np.stack([rows % 10, rows // 10], axis=1) * 5.0
+    spots = 5.0 * np.stack([rows % 10, rows // 10], axis=1).astype(np.float64)
     loco.place(rows, spots, rng.uniform(-np.pi, np.pi, m), rng.uniform(size=m))
     try:
         for _ in range(round(seconds / config.physics.control_dt)):
@@ -410,13 +410,13 @@ def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, fl
     }
 
 
-def count_falls(low: Policy, seed: int) -> dict[str, float]:
+def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
     """Falls while the gait switches at random every 2 s, commands over the full ranges.
 
     A robot that falls stays out, and its time counts up to the fall.
     """
     config = low_config(low)
-    m, dt = _FALL_ROBOTS, config.physics.control_dt
+    m, dt = robots, config.physics.control_dt
     rng = np.random.default_rng((EVAL_STREAM, seed, len(GAITS)))
     switch = round(_SWITCH_SECONDS / dt)
     command = np.zeros((m, 15))
@@ -436,12 +436,13 @@ def count_falls(low: Policy, seed: int) -> dict[str, float]:
 
 def _track(job: tuple[str, int, int], low: Policy) -> dict[str, float]:
     gait, episodes, seed = job
-    return track_gait(low, gait, episodes, seed) if gait else count_falls(low, seed)
+    return track_gait(low, gait, episodes, seed) if gait else count_falls(low, episodes, seed)
 
 
 def tracking(low: Policy, episodes: int, seed: int, workers: int) -> dict[str, Any]:
     """tracking.json: each gait's tracking and the falls."""
-    jobs = [(gait, episodes, seed) for gait in GAITS] + [("", 0, seed)]
+    robots = max(1, round(_FALL_SHARE * episodes))
+    jobs = [(gait, episodes, seed) for gait in GAITS] + [("", robots, seed)]
     work = functools.partial(_track, low=low)
     if workers == 1:
         results = [work(job) for job in jobs]

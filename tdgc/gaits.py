@@ -47,8 +47,7 @@ def normal_cdf(x: NDArray[np.floating], scale: float) -> NDArray[np.float64]:
     z = np.abs(np.asarray(x, dtype=np.float64)) / scale
     t = 1.0 / (1.0 + 0.2316419 * z)
     poly = t * (
-        0.319381530
-        + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429)))
+        0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429)))
     )
     tail = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) * poly
     return np.where(np.asarray(x) >= 0.0, 1.0 - tail, tail)
@@ -108,7 +107,7 @@ class PhaseClock:
         self.phases = np.zeros((num_robots, 4))
         self.contact = desired_contact(self.phases)
 
-    def reset(self, index: ArrayLike, clock: ArrayLike = 0.0) -> None:
+    def reset(self, index: NDArray[np.integer], clock: NDArray[np.floating] | float = 0.0) -> None:
         """Set the clock of the robots in ``index``; call ``update`` to refresh the phases."""
         self.clock[index] = clock
 

@@ -20,7 +20,7 @@ from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig, from_dict
 from tdgc.curriculum import Curriculum
 from tdgc.gaits import GAITS
 from tdgc.locomotion import SPEED_SCALE, Locomotion
-from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE
+from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE, TaskEnv
 from tdgc.policies import Policy
 from tdgc.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.terrain import (
@@ -43,11 +43,7 @@ _PROBE_RANGE = 0.5  # m, deeper and higher looks the same
 
 #: The sparse geometric cue: 32 heights in the heading frame, denser where the feet come next.
 PROBES: Array = np.array(
-    [
-        (x, y)
-        for x in (-0.2, 0.1, 0.3, 0.5, 0.7, 0.9, 1.2, 1.6)
-        for y in (0.3, 0.1, -0.1, -0.3)
-    ]
+    [(x, y) for x in (-0.2, 0.1, 0.3, 0.5, 0.7, 0.9, 1.2, 1.6) for y in (0.3, 0.1, -0.1, -0.3)]
 )
 #: The semantic cue: one-hot over the families, and one place for "unknown".
 SEMANTIC = (*FAMILIES, "unknown")
@@ -159,6 +155,7 @@ class NavigationTask:
         num_robots: M.
         seed: of everything random here.
         training: draw disturbances and let the curriculum move levels.
+        visual: keep what pictures of the ground need.
     """
 
     def __init__(
@@ -168,8 +165,9 @@ class NavigationTask:
         num_robots: int,
         seed: int,
         training: bool = True,
+        visual: bool = False,
     ) -> None:
-        self.config = config
+        self.config, self._visual = config, visual
         self.num_robots = m = num_robots
         self.training = training
         self.low, self.low_config = load_low(low)
@@ -202,7 +200,7 @@ class NavigationTask:
     def _build_locomotion(self) -> Locomotion:
         self._draw_tiles(np.flatnonzero(self._drawn_level != self.curriculum.levels))
         c = self.low_config
-        return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro)
+        return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro, self._visual)
 
     def _draw_tiles(self, index: NDArray[np.integer]) -> None:
         for i in index:
@@ -241,7 +239,9 @@ class NavigationTask:
 
     def _share(self, commands: Array) -> Array:
         """Commands as shares of the decoder's ranges, so that their differences have one scale."""
-        span = np.where(self.decoder.high > self.decoder.low, self.decoder.high - self.decoder.low, 1)
+        span = np.where(
+            self.decoder.high > self.decoder.low, self.decoder.high - self.decoder.low, 1
+        )
         return np.asarray((commands - self.decoder.low) / span)
 
     def restart(self) -> None:
@@ -249,7 +249,6 @@ class NavigationTask:
         self.locomotion.world.close()
         self._drawn_level[:] = -1
         self.locomotion = self._build_locomotion()
-        self.stats = {}
         self.reset(np.arange(self.num_robots))
 
     def step(
@@ -418,10 +417,10 @@ class NavigationTask:
         self.locomotion.world.close()
 
 
-class NavigationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """One robot of ``NavigationTask`` as a Gymnasium environment, id ``tdgc/Navigation-v0``."""
+class NavigationEnv(TaskEnv):
+    """``NavigationTask`` for one robot, id ``tdgc/Navigation-v0``."""
 
-    metadata = {"render_modes": [], "render_fps": 10}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  as in gymnasium
 
     def __init__(
         self,
@@ -429,35 +428,11 @@ class NavigationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         low: str | Path = PRETRAINED / "low",
         render_mode: str | None = None,
     ) -> None:
-        self.config, self._low = config or HighLevelConfig(), low
-        self.render_mode = render_mode
-        self.task = NavigationTask(self.config, low, 1, seed=0)
-        self.action_space = self.task.action_space
-        self.observation_space = self.task.observation_space
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; a seed makes all that follows repeatable."""
-        super().reset(seed=seed)
-        if seed is not None:
-            self.task.close()
-            self.task = NavigationTask(self.config, self._low, 1, seed=seed)
-        self.task.reset(np.arange(1))
-        return self.task.observe()[0], {}
-
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """One decision; ``info`` has whether the goal was reached."""
-        reward, terminated, truncated = self.task.step(np.asarray(action)[None])
-        info = {"is_success": bool(self.task.reached[0])}
-        obs = self.task.observe()[0]
-        return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
-
-    def close(self) -> None:
-        """Disconnect from Bullet."""
-        self.task.close()
+        self.config = config or HighLevelConfig()
+        super().__init__(
+            lambda seed, visual: NavigationTask(self.config, low, 1, seed, visual=visual),
+            render_mode,
+        )
 
 
 def summarise(sums: dict[str, float]) -> dict[str, float]:

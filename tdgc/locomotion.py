@@ -101,12 +101,13 @@ class Locomotion:
         physics: PhysicsConfig,
         field: TileField | None,
         gyro: bool = False,
+        visual: bool = False,
     ) -> None:
         self.num_robots = num_robots
         self.robot = robot
         self.physics = physics
         self.gyro = gyro
-        self.world = World(num_robots, robot, physics, field)
+        self.world = World(num_robots, robot, physics, field, visual)
         self.clock = PhaseClock(num_robots)
         self.nominal = nominal_pose(robot)
         self.command = np.tile(default_command(), (num_robots, 1))
@@ -164,7 +165,7 @@ class Locomotion:
         self.delay[index] = draw(config.latency, 0.0)
         self.world.set_dynamics(index, self.friction[index], self.payload[index])
 
-    def act(self, actions: Array) -> None:
+    def act(self, actions: NDArray[np.floating]) -> None:
         """One control step: clip, scale, delay, PD control in Bullet, clock (Sec. IV-A).
 
         Args:
@@ -175,7 +176,8 @@ class Locomotion:
         """
         if not np.isfinite(actions).all():
             raise ValueError("an action must be finite; it has NaN or infinite values")
-        clipped = np.clip(actions, -self.robot.action_limit, self.robot.action_limit)
+        limit = self.robot.action_limit
+        clipped = np.clip(np.asarray(actions, dtype=np.float64), -limit, limit)
         self.actions = np.stack([clipped, self.actions[0]])
         self.targets = np.concatenate([joint_targets(self.robot, clipped)[None], self.targets[:-1]])
         self.world.step(self.targets, self.delay, self.joint_offset)

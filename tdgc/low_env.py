@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -87,12 +88,18 @@ class LowLevelTask:
         num_robots: M.
         seed: of everything random here.
         training: draw noise, pushes and randomised dynamics.
+        visual: keep what pictures of the ground need.
     """
 
     def __init__(
-        self, config: LowLevelConfig, num_robots: int, seed: int, training: bool = True
+        self,
+        config: LowLevelConfig,
+        num_robots: int,
+        seed: int,
+        training: bool = True,
+        visual: bool = False,
     ) -> None:
-        self.config = config
+        self.config, self._visual = config, visual
         self.num_robots = num_robots
         self.training = training
         self.rng = np.random.default_rng(seed)
@@ -149,7 +156,7 @@ class LowLevelTask:
 
     def _build_locomotion(self) -> Locomotion:
         c = self.config
-        return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro)
+        return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro, self._visual)
 
     # ------------------------------------------------------------------ episodes
 
@@ -193,7 +200,6 @@ class LowLevelTask:
             self._draw_tiles()
         self.locomotion = self._build_locomotion()
         self._gait_scores[:] = 0.0
-        self.stats = {}
         self.reset(np.arange(self.num_robots))
         # Spread the ends of the coming episodes over time.
         self.elapsed[:] = self.rng.integers(0, self.horizon, self.num_robots)
@@ -360,11 +366,14 @@ class LowLevelTask:
         self.locomotion.world.push(index, speed[:, None] * velocity)
         self._schedule_push(index)
 
+    @property
+    def reached(self) -> NDArray[np.bool_]:
+        """Whether each robot has crossed its tile in this episode, (M,)."""
+        return self._reached
+
     # ------------------------------------------------------------------ curriculum, statistics
 
-    def _update_curriculum(
-        self, done: NDArray[np.bool_], failed: NDArray[np.bool_]
-    ) -> None:
+    def _update_curriculum(self, done: NDArray[np.bool_], failed: NDArray[np.bool_]) -> None:
         """Move robots that end an episode between levels, as legged_gym does.
 
         Up when the tile was crossed; down when less than half of it was, unless only a part of an
@@ -382,9 +391,7 @@ class LowLevelTask:
         self.level[solved] = self.rng.integers(0, top + 1, int(solved.sum()))
         self.level = np.clip(self.level, 0, top)
 
-    def _count(
-        self, terms: dict[str, Array], reward: Array, terminated: NDArray[np.bool_]
-    ) -> None:
+    def _count(self, terms: dict[str, Array], reward: Array, terminated: NDArray[np.bool_]) -> None:
         """Add this step to ``stats`` (sums; ``tdgc.training`` divides and logs them)."""
         loco, stats = self.locomotion, self.stats
 
@@ -468,15 +475,21 @@ class LowLevelTask:
         self.locomotion.world.close()
 
 
-class LowLevelEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """One robot of ``LowLevelTask`` as a Gymnasium environment, id ``tdgc/LowLevel-v0``."""
+class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One robot of a task as a Gymnasium environment.
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
+    Args:
+        make_task: (seed, whether pictures are wanted) -> the task of one robot. A reset with a seed
+            makes it anew, so that all that follows is repeatable.
+        render_mode: None, or rgb_array for pictures of 640 x 400.
+    """
 
-    def __init__(self, config: LowLevelConfig | None = None, render_mode: str | None = None):
-        self.config = config or LowLevelConfig()
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012  as in gymnasium
+
+    def __init__(self, make_task: Callable[[int, bool], Any], render_mode: str | None) -> None:
         self.render_mode = render_mode
-        self.task = LowLevelTask(self.config, 1, seed=0)
+        self._make_task = make_task
+        self.task = make_task(0, render_mode is not None)
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space
 
@@ -486,7 +499,7 @@ class LowLevelEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         super().reset(seed=seed)
         if seed is not None:
             self.task.close()
-            self.task = LowLevelTask(self.config, 1, seed=seed)
+            self.task = self._make_task(seed, self.render_mode is not None)
         self.task.reset(np.arange(1))
         return self.task.observe()[0], {}
 
@@ -494,10 +507,30 @@ class LowLevelEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         reward, terminated, truncated = self.task.step(np.asarray(action)[None])
-        return self.task.observe()[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+        info = {"is_success": bool(self.task.reached[0])}
+        obs = self.task.observe()[0]
+        return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        if self.render_mode is None:
+            return None
+        picture: NDArray[np.uint8] = self.task.locomotion.world.picture(0)
+        return picture
 
     def close(self) -> None:
         self.task.close()
+
+
+class LowLevelEnv(TaskEnv):
+    """``LowLevelTask`` for one robot, id ``tdgc/LowLevel-v0``."""
+
+    def __init__(
+        self, config: LowLevelConfig | None = None, render_mode: str | None = None
+    ) -> None:
+        self.config = config or LowLevelConfig()
+        super().__init__(
+            lambda seed, visual: LowLevelTask(self.config, 1, seed, visual=visual), render_mode
+        )
 
 
 def summarise(sums: dict[str, float]) -> dict[str, float]:

@@ -10,10 +10,10 @@ import matplotlib
 
 matplotlib.use("Agg")  # no display needed
 
-import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
-from tdgc.gaits import GAITS  # noqa: E402
+from tdgc.gaits import GAITS
 
 _COLOURS = {"tdgc": "tab:blue", "gp": "tab:orange"}
 
@@ -45,8 +45,9 @@ def success_by_level(summary: Path, out: Path) -> None:
             cells = {k: v for k, v in table[policy][condition][family].items() if k != "mean"}
             levels = [int(k) for k in cells]
             rates = [100 * c["rate"] for c in cells.values()]
-            below = [100 * (c["rate"] - c["ci_low"]) for c in cells.values()]
-            above = [100 * (c["ci_high"] - c["rate"]) for c in cells.values()]
+            # max: at 0 and 100 % an end of the interval is the rate, but for rounding.
+            below = [100 * max(0.0, c["rate"] - c["ci_low"]) for c in cells.values()]
+            above = [100 * max(0.0, c["ci_high"] - c["rate"]) for c in cells.values()]
             label = policy if condition == "nominal" else f"{policy}, {condition}"
             colour = _COLOURS.get(policy) if condition == "nominal" else None
             axis.errorbar(

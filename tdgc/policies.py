@@ -10,7 +10,7 @@ critic, ``NAME.json`` says what they mean::
                       "critic": [256, 128],
                       "lstm": null},                  hidden size of both LSTMs; null for "mlp"
      "observation": {"size": 95, "actor_size": 70},   [actor part | critic-only part]
-     "mirror": null,                                  or how left and right are exchanged, see Mirror
+     "mirror": null,                                  or how left and right change places
      "action": {"size": 12, "low": [...], "high": [...]},            null: unbounded
      "sha256": "...",                                 of NAME.safetensors
      "meta": {...}}                                   the caller's: configuration, seed, steps, ...
@@ -717,9 +717,9 @@ class Policy:
         if header.mirror is not None:
             log_std = 0.5 * (log_std + log_std[list(header.mirror.action_index)])
         self._std: Array = np.exp(log_std)
-        self._mirror = header.mirror and tuple(
-            th.tensor(part) for part in dataclasses.astuple(header.mirror)
-        )
+        self._mirror: tuple[th.Tensor, ...] | None = None
+        if header.mirror is not None:
+            self._mirror = tuple(th.tensor(part) for part in dataclasses.astuple(header.mirror))
         self.seed(0)
 
     def seed(self, seed: int | None) -> None:

@@ -120,9 +120,7 @@ def raibert_foothold(s: LowStep) -> Array:
     """Squared distance of the feet from Raibert's footholds, summed, m^2."""
     arm = s.state.foot_position[..., :2] - s.state.position[:, None, :2]
     c, d = np.cos(s.state.yaw)[:, None], np.sin(s.state.yaw)[:, None]
-    feet = np.stack(
-        [c * arm[..., 0] + d * arm[..., 1], c * arm[..., 1] - d * arm[..., 0]], axis=-1
-    )
+    feet = np.stack([c * arm[..., 0] + d * arm[..., 1], c * arm[..., 1] - d * arm[..., 0]], axis=-1)
     error = feet - raibert_targets(s.command, s.phases)
     return np.asarray(np.einsum("mfi,mfi->m", error, error))
 
@@ -163,7 +161,7 @@ def action_rate(s: LowStep) -> Array:
 
 def foot_slip(s: LowStep) -> Array:
     """Squared horizontal speed of feet in contact now or a step ago, summed, m^2/s^2."""
-    touching = (s.state.foot_force > CONTACT_FORCE) | s.was_contact
+    touching = np.logical_or(s.state.foot_force > CONTACT_FORCE, s.was_contact)
     return np.sum(touching * _square_sum(s.state.foot_velocity[..., :2]), axis=1)
 
 

@@ -64,9 +64,7 @@ def joint_targets(config: RobotConfig, actions: Array) -> Array:
     return np.asarray(nominal_pose(config) + scale * clipped)
 
 
-def pd_torque(
-    error: Array, speed: Array, strength: Array, config: RobotConfig
-) -> Array:
+def pd_torque(error: Array, speed: Array, strength: Array, config: RobotConfig) -> Array:
     """Joint torques of the PD law, limited as the motors are.
 
     Args:
@@ -164,9 +162,7 @@ class RobotState:
         quaternion[:, 3] = 1.0
         arrays = [np.zeros((m, n)) for n in (3, 3, 12, 12, 12, 4, 4)]
         lin, ang, q, qd, torque, foot, leg = arrays
-        state = cls(
-            np.zeros((m, 3)), quaternion, lin, ang, q, qd, torque, foot, leg, np.zeros(m)
-        )
+        state = cls(np.zeros((m, 3)), quaternion, lin, ang, q, qd, torque, foot, leg, np.zeros(m))
         state.derive()
         return state
 

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import safetensors.torch
@@ -28,6 +28,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
 from tqdm import tqdm
 
 from tdgc import __version__, policies
@@ -79,7 +80,7 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, extra: dict[str, Any]) -
         "code": __version__,
         "sha256": hashlib.sha256(data).hexdigest(),
         "num_timesteps": model.num_timesteps,
-        "n_updates": model._n_updates,  # type: ignore[attr-defined]
+        "n_updates": model._n_updates,
         "random": random_states,
         **extra,
     }
@@ -158,7 +159,7 @@ def load_learner(
         line = str(error).splitlines()[0]
         raise CheckpointError(f"the checkpoint does not fit the configuration: {line}") from error
     model.num_timesteps = int(header["num_timesteps"])
-    model._n_updates = int(header["n_updates"])  # type: ignore[attr-defined]
+    model._n_updates = int(header["n_updates"])
     _restore_random(tensors, header["random"])
 
 
@@ -261,7 +262,8 @@ class RunCallback(BaseCallback):
         extra = {"workers": states, "seconds": self.seconds, "phase": self.phase}
         save_checkpoint(self.run / "checkpoints", self.model, extra)
         meta = {**self.meta, "steps": self.num_timesteps, "seconds": round(self.seconds)}
-        policies.save(self.run / "policy", self.model.policy, meta)
+        policy = cast(ActorCriticPolicy, self.model.policy)
+        policies.save(self.run / "policy", policy, meta)
         restart(self.model, self.env)
         self._saved_at = self.num_timesteps
 
@@ -281,9 +283,9 @@ class RunCallback(BaseCallback):
             values["episode/return"] = float(np.mean(returns))
             values["episode/length"] = float(np.mean(lengths))
         for name in ("value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "std"):
-            value = self.logger.name_to_value.get(f"train/{name}")
-            if value is not None:
-                values[f"train/{name}"] = float(value)
+            number = self.logger.name_to_value.get(f"train/{name}")
+            if number is not None:
+                values[f"train/{name}"] = float(number)
         for key, value in values.items():
             self.logger.record(key, value)
         self.logger.dump(self.num_timesteps)
@@ -303,7 +305,7 @@ def _short(value: float) -> float:
 def restart(model: BaseAlgorithm, env: TaskVecEnv) -> None:
     """Begin new episodes everywhere; the learner forgets the observations it held."""
     model._last_obs = env.reset()
-    model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)  # type: ignore[attr-defined]
+    model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
     model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
 
 
@@ -337,12 +339,14 @@ def tensorboard_logger(folder: Path) -> Logger:
 class TrainConfig(Protocol):
     """What the configurations of both trainers have in common."""
 
-    seed: int
-    n_envs: int
-    workers: int
-    steps: int
-    log_steps: int
-    checkpoint_steps: int
+    @property
+    def steps(self) -> int: ...
+
+    @property
+    def log_steps(self) -> int: ...
+
+    @property
+    def checkpoint_steps(self) -> int: ...
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing as mp
 import os
+import signal
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -21,16 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-Index = tuple[NDArray[np.int64], NDArray[np.float32]]
-
 
 class Task(Protocol):
     """An MDP of M robots, as ``tdgc.low_env.LowLevelTask`` is one."""
 
     num_robots: int
     actor_dim: int
-    observation_space: gym.spaces.Box
-    action_space: gym.spaces.Box
+    observation_space: gym.spaces.Box[Any]
+    action_space: gym.spaces.Box[Any]
 
     def reset(self, index: NDArray[np.integer]) -> None: ...
 
@@ -83,15 +82,15 @@ class _Shared:
         width = {"actions": action_dim, "obs": obs_dim, "last_obs": obs_dim}
         views: dict[str, NDArray[Any]] = {}
         for name, raw in self._raw.items():
-            flat = np.frombuffer(raw, dtype=np.float32 if name in (*width, "rewards") else np.int8)  # type: ignore[call-overload]
+            dtype = np.float32 if name in (*width, "rewards") else np.int8
+            flat: NDArray[Any] = np.frombuffer(raw, dtype=dtype)
             views[name] = flat.reshape(num, width[name]) if name in width else flat
         return views
 
 
-def _work(
-    pipe: Connection, make_task: MakeTask, rows: slice, seed: int, shared: _Shared
-) -> None:
+def _work(pipe: Connection, make_task: MakeTask, rows: slice, seed: int, shared: _Shared) -> None:
     """A worker's life: answer one word at a time until told to close or the pipe ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is the parent's to answer
     task: Task | None = None
     try:
         views = {name: view[rows] for name, view in shared.arrays().items()}
@@ -128,8 +127,8 @@ def _work(
                 return
             busy += time.perf_counter() - started
             pipe.send(answer)
-    except (EOFError, BrokenPipeError, KeyboardInterrupt):
-        pass  # the parent is gone, or stops us together with itself
+    except (EOFError, BrokenPipeError):
+        pass  # the parent is gone
     except Exception:
         with contextlib.suppress(OSError):
             pipe.send(WorkerError(traceback.format_exc()))

@@ -39,8 +39,8 @@ class _Client:
     each function is bound once, at its first use.
     """
 
-    def __init__(self, mode: int, first_row: int) -> None:
-        self.id: int = pybullet.connect(mode)
+    def __init__(self, first_row: int) -> None:
+        self.id: int = pybullet.connect(pybullet.DIRECT)
         self.first_row = first_row  # of the world's robots
         self.rows: dict[int, int] = {}  # row of the world that a body of this client is
         self.ground = -1
@@ -60,10 +60,10 @@ CLIENT_ROBOTS = 10
 
 
 class World:
-    """M robots on a plane or on a field of tiles, one tile row a robot or all on one field.
+    """M robots on a plane, or each on a tile row of its own in a field.
 
-    Robots are spread over several Bullet clients, ``CLIENT_ROBOTS`` in each; on a field with one
-    tile row a robot, a client holds its own robots' rows only.
+    Robots are spread over several Bullet clients, ``CLIENT_ROBOTS`` in each; a client holds its own
+    robots' part of the field only. ``visual`` keeps what is needed to draw the ground.
 
     Attributes:
         state: the ``RobotState`` after the last step or reset.
@@ -77,7 +77,7 @@ class World:
         robot: RobotConfig,
         physics: PhysicsConfig,
         field: TileField | None = None,
-        gui: bool = False,
+        visual: bool = False,
     ) -> None:
         if field is not None and field.shape[0] != num_robots:
             raise ValueError(f"{num_robots} robots need as many tile rows, not {field.shape[0]}")
@@ -85,6 +85,7 @@ class World:
         self.robot = robot
         self.physics = physics
         self.field = field
+        self._visual = visual
         self.strength = np.ones((num_robots, 1))
         self.bullet_seconds = 0.0
         self.state = RobotState.zeros(num_robots)
@@ -93,7 +94,7 @@ class World:
         self._client_of: list[_Client] = []
         parts = -(-num_robots // CLIENT_ROBOTS)
         for rows in np.array_split(np.arange(num_robots), parts):
-            client = _Client(pybullet.GUI if gui else pybullet.DIRECT, int(rows[0]))
+            client = _Client(int(rows[0]))
             client.setGravity(0.0, 0.0, -GRAVITY)
             # No early stop of the solver: it would couple robots through the worst residual.
             client.setPhysicsEngineParameter(
@@ -108,9 +109,7 @@ class World:
                 self._client_of.append(client)
                 client.rows[self._bodies[-1]] = int(rows[k])
             self._clients.append(client)
-        self._trunk_inertia = np.array(
-            self._client_of[0].getDynamicsInfo(self._bodies[0], -1)[2]
-        )
+        self._trunk_inertia = np.array(self._client_of[0].getDynamicsInfo(self._bodies[0], -1)[2])
         self._active = np.arange(num_robots)
 
     def _make_ground(self, client: _Client, count: int) -> None:
@@ -133,9 +132,11 @@ class World:
                 0.5 * (ny - 1) * cell,
                 0.5 * (HEIGHT_RANGE[0] + HEIGHT_RANGE[1]),
             ]
-            # A visual of its own, or Bullet keeps 360 bytes a sample to draw the field.
-            dot = client.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001)
-            client.ground = client.createMultiBody(0.0, client.shape, dot, basePosition=centre)
+            # Without a visual of its own, Bullet keeps 360 bytes a sample to draw the field.
+            drawn = -1
+            if not self._visual:
+                drawn = client.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001)
+            client.ground = client.createMultiBody(0.0, client.shape, drawn, basePosition=centre)
             self._upload(client, heights, client.shape)
         client.changeDynamics(client.ground, -1, lateralFriction=1.0)  # feet carry the friction
         client.setCollisionFilterGroupMask(client.ground, -1, _GROUND, _ROBOT)
@@ -334,6 +335,26 @@ class World:
     def support_height(self, x: Array, y: Array) -> Array:
         """Height in m of the support surface of the fall rule: trenches filled, no pillars."""
         return np.zeros_like(x) if self.field is None else self.field.support_at(x, y)
+
+    def picture(
+        self, row: int, width: int = 640, height: int = 400, azimuth: float = -0.9
+    ) -> NDArray[np.uint8]:
+        """Robot ``row`` and its ground from the side, (height, width, 3), without a display.
+
+        ``azimuth`` is where the camera stands, rad from the world's x axis. Terrain is drawn in
+        worlds made with ``visual`` only.
+        """
+        client, target = self._client_of[row], self.state.position[row]
+        eye = target + [1.3 * np.cos(azimuth), 1.3 * np.sin(azimuth), 0.45]
+        _, _, pixels, _, _ = client.getCameraImage(
+            width,
+            height,
+            client.computeViewMatrix(eye.tolist(), target.tolist(), [0.0, 0.0, 1.0]),
+            client.computeProjectionMatrixFOV(45.0, width / height, 0.05, 30.0),
+            renderer=pybullet.ER_TINY_RENDERER,
+            lightDirection=[0.5, -1.0, 2.0],
+        )
+        return np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
 
     def close(self) -> None:
         """Disconnect from Bullet; the world is of no use afterwards."""

@@ -127,13 +127,13 @@ def test_an_action_of_another_shape(shape: tuple[int, ...]) -> None:
 def test_an_action_that_is_not_finite(value: float, channel: int) -> None:
     action = np.zeros((2, 13))
     action[1, channel] = value
-    with pytest.raises(ValueError, match="^an action must be finite; it has NaN or infinite"):
+    with pytest.raises(ValueError, match=r"^an action must be finite; it has NaN or infinite"):
         CommandDecoder().decode(action)
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, float("nan")])
 def test_an_action_limit_that_is_none(limit: float) -> None:
-    with pytest.raises(ValueError, match="^action_limit must be positive, not"):
+    with pytest.raises(ValueError, match=r"^action_limit must be positive, not"):
         CommandDecoder(action_limit=limit)
 
 

@@ -185,5 +185,5 @@ def test_state_of_another_curriculum_is_refused():
             curriculum.load_state_dict(state)
         assert curriculum.levels.max() == 0
     del state["counts"]
-    with pytest.raises(ValueError, match="keys"):
+    with pytest.raises(ValueError, match=r"keys"):
         Curriculum(3, 5, 4, LEVELS).load_state_dict(state)

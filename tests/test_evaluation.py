@@ -43,7 +43,7 @@ def test_wilson_interval_is_the_textbook_one():
     low, high = wilson_interval(8, 10)
     assert low == pytest.approx(0.4902, abs=5e-5) and high == pytest.approx(0.9433, abs=5e-5)
     assert wilson_interval(0, 20)[0] == 0.0 and wilson_interval(20, 20)[1] == 1.0
-    with pytest.raises(ValueError, match="0 <= reached <= n"):
+    with pytest.raises(ValueError, match=r"0 <= reached <= n"):
         wilson_interval(3, 2)
 
 

@@ -238,7 +238,7 @@ def test_bounds_outside_the_low_levels_training_are_refused():
 
 
 def test_nan_action_is_refused(task):
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ValueError, match=r"finite"):
         task.step(np.full((5, 13), np.nan))
 
 

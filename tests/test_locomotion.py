@@ -14,11 +14,9 @@ from tdgc.gaits import gait_embedding
 from tdgc.locomotion import (
     ACTOR_LAYOUT,
     GYRO_LAYOUT,
-    MIRRORS,
     SPEED_SCALE,
     Locomotion,
     action_mirror,
-    mirror_map,
 )
 from tdgc.low_env import CRITIC_LAYOUT, LowLevelTask
 from tdgc.robot import FOOT_RADIUS, Array, nominal_pose
@@ -142,9 +140,7 @@ def test_command_clock_and_gait(loco: Locomotion) -> None:
 
 def test_noise_is_on_measured_parts_only_and_within_its_width(loco: Locomotion) -> None:
     quiet = loco.observe()
-    noise = RandomisationConfig(
-        noise_gravity=0.05, noise_joint_angle=0.01, noise_joint_speed=1.5
-    )
+    noise = RandomisationConfig(noise_gravity=0.05, noise_joint_angle=0.01, noise_joint_speed=1.5)
     rng = np.random.default_rng(0)
     error = np.array([loco.observe(noise, rng) - quiet for _ in range(200)])
     widths = {"gravity": 0.05, "joint_error": 0.01, "joint_speed": 1.5 * SPEED_SCALE}
@@ -179,7 +175,7 @@ def test_an_action_that_is_not_finite(loco: Locomotion, value: float) -> None:
     actions = np.zeros((2, 12))
     actions[1, 5] = value
     before = loco.observe()
-    with pytest.raises(ValueError, match="^an action must be finite; it has NaN or infinite"):
+    with pytest.raises(ValueError, match=r"^an action must be finite; it has NaN or infinite"):
         loco.act(actions)
     assert (loco.observe() == before).all()
 
@@ -369,7 +365,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
     critic, where = first[task.actor_dim :], slices(CRITIC_LAYOUT)
     # What is compared is not all alike: the slope shows left to right, the stairs along x.
     probes = critic[where["terrain"]].reshape(5, 3)
-    assert (probes[:, 0] - probes[:, 2] > 0.1).all() and np.ptp(probes[:, 1]) > 0.2
+    assert (probes[:, 0] - probes[:, 2] > 0.04).all() and np.ptp(probes[:, 1]) > 0.2
     assert np.ptp(critic[where["foot_height"]]) > 0.01
     dynamics = critic[where["dynamics"]].tolist()
     assert dynamics == pytest.approx([0.6, 0.5, 0.0, 0.4])

@@ -319,7 +319,7 @@ def test_load_into_restores_every_parameter(tmp_path, make):
 def test_load_into_refuses_another_architecture(saved):
     with pytest.raises(PolicyFileError, match=r"actor is \(8, 5\), this policy's \(256, 128\)"):
         policies.load_into(saved, mlp_policy())
-    with pytest.raises(PolicyFileError, match="kind is mlp, this policy's lstm"):
+    with pytest.raises(PolicyFileError, match=r"kind is mlp, this policy's lstm"):
         policies.load_into(saved, lstm_policy())
 
 
@@ -361,7 +361,7 @@ def test_failed_write_leaves_the_old_policy_and_no_scraps(saved):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # as good as a full disk
     try:
-        with pytest.raises(OSError, match="File too large"):
+        with pytest.raises(OSError, match=r"File too large"):
             policies.save(saved, mlp_policy(), {"seed": 1})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -25,32 +25,41 @@ TRAIN = "--steps 128 --n-envs 4 --workers 1"
 COMMANDS: dict[str, str | None] = {
     "python3 -m venv .venv": BY_CI,
     ".venv/bin/pip install -c constraints.txt -e .": BY_CI,
-    ".venv/bin/python train_low.py --time-limit 600": f"{TRAIN} --out {{tmp}}/first",
+    ".venv/bin/python evaluate.py --levels 6-10": (
+        "--levels 6 --families tilt --episodes 1 --workers 1 --out {tmp}/first"
+    ),
     ".venv/bin/pip install -c constraints.txt -e '.[dev]'": BY_CI,
     ".venv/bin/python -m pytest": BY_CI,
     "python train_low.py": f"{TRAIN} --out {{tmp}}/low",
     "python train_low.py --resume --time-limit 3600": "--steps 256 --out {tmp}/low",
     "tensorboard --logdir runs": "--inspect --logdir {tmp}",
+    "python train_high.py --low runs/low/policy": (
+        "--low {tmp}/low/policy --steps 16 --n-envs 4 --workers 1 --set ppo.n_steps=2 "
+        "--set ppo.minibatches=1 --out {tmp}/high"
+    ),
     "python evaluate.py --low runs/low/policy --levels 6-10": (
         "--low {tmp}/low/policy --levels 6 --families tilt --episodes 1 --workers 1 "
         "--out {tmp}/evaluation"
     ),
+    "python evaluate.py --tracking": "--episodes 1 --workers 1 --out {tmp}/tracking",
     "python -m tdgc.bench --out runs/bench": (
         "--robots 2 --workers 1 --seconds 0.1 --out {tmp}/bench"
     ),
 }
 #: What is in ``{tmp}`` afterwards.
 OUTPUTS = (
-    "first/policy.safetensors",
+    "first/summary.json",
     "low/config.json",
     "low/policy.json",
     "low/policy.safetensors",
     "low/checkpoints/step-000000000128",
     "low/checkpoints/step-000000000256",
     "low/tensorboard",
+    "high/policy.safetensors",
     "evaluation/episodes.csv",
     "evaluation/summary.json",
     "evaluation/success.png",
+    "tracking/tracking.json",
     "bench/bench.json",
 )
 PROGRAMS = {

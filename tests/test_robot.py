@@ -154,9 +154,7 @@ def test_state_in_the_heading_frame() -> None:
     state.lin_vel[0] = [0.3, 1.0, -0.2]
     state.derive()
     np.testing.assert_allclose(state.heading_vel[0], [1.0, -0.3, -0.2], atol=1e-12)
-    np.testing.assert_allclose(
-        state.gravity[0], [math.sin(0.2), 0.0, -math.cos(0.2)], atol=1e-12
-    )
+    np.testing.assert_allclose(state.gravity[0], [math.sin(0.2), 0.0, -math.cos(0.2)], atol=1e-12)
     assert state.yaw[0] == pytest.approx(math.pi / 2, abs=1e-12)
 
 

@@ -108,9 +108,9 @@ def test_bad_difficulty_names_the_range(difficulty):
 
 
 def test_bad_family_names_the_families():
-    with pytest.raises(ValueError, match="'stairs'; choose from rough, pillar, .*, mixed$"):
+    with pytest.raises(ValueError, match=r"'stairs'; choose from rough, pillar, .*, mixed$"):
         tile("stairs", 0.5)
-    with pytest.raises(ValueError, match="'mixed'; choose from rough, .*, tilt$"):
+    with pytest.raises(ValueError, match=r"'mixed'; choose from rough, .*, tilt$"):
         difficulty_parameter("mixed", 0.5)
 
 
@@ -168,7 +168,7 @@ def test_pillars_keep_clear_and_inside():
 
 def test_pillars_that_cannot_fit_raise():
     narrow = terrain.Section(1.5, 1.5, 2.0, 2.0)
-    with pytest.raises(RuntimeError, match="no room for 28 pillars"):
+    with pytest.raises(RuntimeError, match=r"no room for 28 pillars"):
         terrain.place_pillars(narrow, 28, np.random.default_rng(0))
 
 
@@ -356,17 +356,17 @@ def test_training_and_evaluation_grids_differ():
 
 def test_grid_stays_within_bullets_limit():
     TerrainGrid((0,) * 16, ("rough",) * 5, seed=0)  # 80 tiles
-    with pytest.raises(ValueError, match="1 to 80 tiles .* got 9 x 9"):
+    with pytest.raises(ValueError, match=r"1 to 80 tiles .* got 9 x 9"):
         TerrainGrid((0,) * 9, ("rough",) * 9, seed=0)
-    with pytest.raises(ValueError, match="got 0 x 1"):
+    with pytest.raises(ValueError, match=r"got 0 x 1"):
         TerrainGrid.build((), ("rough",), seed=0)
 
 
 def test_grid_checks_levels_and_families():
     for level in (-1, 13, 2.5):
-        with pytest.raises(ValueError, match="whole numbers from 0 to 12"):
+        with pytest.raises(ValueError, match=r"whole numbers from 0 to 12"):
             TerrainGrid.build((level,), ("rough",), seed=0)
-    with pytest.raises(ValueError, match="unknown terrain family 'ramp'"):
+    with pytest.raises(ValueError, match=r"unknown terrain family 'ramp'"):
         TerrainGrid.build((0,), ("ramp",), seed=0)
 
 

@@ -13,6 +13,8 @@ import pybullet
 import pytest
 
 from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.locomotion import Locomotion
+from tdgc.low_env import is_fallen
 from tdgc.robot import (
     FOOT_RADIUS,
     TRUNK_MASS,
@@ -154,7 +156,7 @@ def test_ground_of_a_plane_and_support_of_tiles(plane: World) -> None:
 def test_fields_that_do_not_fit() -> None:
     with pytest.raises(ValueError, match=r"^3 robots need as many tile rows, not 2$"):
         World(3, ROBOT, PHYSICS, TileField((2, 1)))
-    with pytest.raises(ValueError, match="^Bullet holds 2097152 samples a field, not 2332890$"):
+    with pytest.raises(ValueError, match=r"^Bullet holds 2097152 samples a field, not 2332890$"):
         World(10, ROBOT, PHYSICS, TileField((10, 9)))
     field = TileField((1, 1), crop=2.9)
     field.heights[5, 5] = HEIGHT_RANGE[1] + 0.01
@@ -163,7 +165,7 @@ def test_fields_that_do_not_fit() -> None:
     field.heights[5, 5] = 0.0
     world = World(1, ROBOT, PHYSICS, field)
     field.heights[5, 5] = -2.2
-    with pytest.raises(ValueError, match="^heights -2.20"):
+    with pytest.raises(ValueError, match=r"^heights -2.20"):
         world.upload_terrain()
     world.close()
 
@@ -171,7 +173,7 @@ def test_fields_that_do_not_fit() -> None:
 def test_a_urdf_without_the_joints(tmp_path: Path) -> None:
     urdf = tmp_path / "box.urdf"
     urdf.write_text('<robot name="box"><link name="trunk"/></robot>', encoding="utf-8")
-    with pytest.raises(ValueError, match="lacks the joints FL_hip_joint, FL_thigh_joint"):
+    with pytest.raises(ValueError, match=r"lacks the joints FL_hip_joint, FL_thigh_joint"):
         World(1, RobotConfig(urdf=str(urdf)), PHYSICS)
 
 
@@ -342,6 +344,50 @@ def test_joint_offset_shifts_where_the_motors_pull(plane: World) -> None:
     for _ in range(30):
         plane.step(np.tile(NOMINAL, (3, 1, 1)), np.zeros(1), offset)
     np.testing.assert_allclose(plane.state.q[0], NOMINAL + 0.02, atol=1e-3)
+
+
+# ------------------------------------------------------------------ sinking
+
+
+def free_spot(field: TileField, row: int, rng: np.random.Generator) -> Array:
+    """A point of the challenge zone without a pillar within 0.45 m."""
+    angle, radius = np.meshgrid(np.linspace(0.0, 2 * math.pi, 24), np.linspace(0.0, 0.45, 10))
+    around = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    while True:
+        spot = field.origin(row, 0) + rng.uniform([1.8, 2.5], [6.2, 5.5])
+        points = spot + around
+        above = field.height_at(points[..., 0], points[..., 1]).max()
+        if above - field.support_at(spot[0], spot[1]) < 0.4:
+            return spot
+
+
+@pytest.mark.parametrize("family", ALL_FAMILIES)
+def test_feet_do_not_sink(family: str) -> None:
+    """Level 10, joint targets drawn anew each control step within 0.75 rad of the nominal pose:
+    at most 0.1 % of foot samples are more than 1 cm below the surface. Robots that fall or leave
+    their tile start again elsewhere."""
+    robots, index, rng = 8, np.arange(8), np.random.default_rng(10)
+    field = tiles([family] * robots, crop=1.0, seed=10)
+    loco = Locomotion(robots, ROBOT, PHYSICS, field)
+    world, samples, sunk = loco.world, 0, 0
+    done = np.ones(robots, dtype=bool)
+    for _ in range(150):
+        which = np.flatnonzero(done)
+        if which.size:
+            xy = np.array([free_spot(field, row, rng) for row in which])
+            loco.place(which, xy, rng.uniform(-3.0, 3.0, which.size), np.zeros(which.size))
+        reach = 0.75 / ROBOT.action_scale
+        loco.act(rng.uniform(-reach, reach, (robots, 12)))
+        x, y, z = np.moveaxis(world.state.foot_position, -1, 0)
+        clearance = z - FOOT_RADIUS - world.ground_height(x, y)
+        on = field.on_tile(index[:, None], 0, x, y)
+        samples += int(on.sum())
+        sunk += int(((clearance < -0.01) & on).sum())
+        position = world.state.position
+        done = is_fallen(world) | ~field.on_tile(index, 0, position[:, 0], position[:, 1])
+    world.close()
+    assert samples > 4500
+    assert sunk <= 0.001 * samples
 
 
 # ------------------------------------------------------------------ latency

@@ -1,0 +1,697 @@
+"""The execution-level MDP: episodes, commands, pushes, levels, and a future that repeats."""
+
+import dataclasses
+import json
+import math
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pybullet
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import tdgc.low_env as low_env
+from tdgc.commands import INDEX, gait_index
+from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
+from tdgc.low_env import CRITIC_LAYOUT, LowLevelEnv, LowLevelTask, is_fallen, summarise
+from tdgc.robot import Array, RobotState, nominal_pose, yaw_quaternion
+from tdgc.terrain import make_tile, tile_rng
+
+NOMINAL = nominal_pose(RobotConfig())
+PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4))
+TILES = LowLevelConfig(terrain="tiles", physics=PhysicsConfig(substeps=4))
+
+
+def still(task: LowLevelTask) -> Array:
+    return np.zeros((task.num_robots, 12))
+
+
+def begin(config: LowLevelConfig, robots: int = 1, training: bool = False) -> LowLevelTask:
+    task = LowLevelTask(config, robots, seed=0, training=training)
+    task.reset(np.arange(robots))
+    return task
+
+
+def put(task: LowLevelTask, robot: int, local_xy: tuple[float, float], yaw: float = 0.0) -> None:
+    """A robot at a point of its tile's frame."""
+    assert task.field is not None
+    xy = task.field.origin([robot], 0) + np.array([local_xy])
+    task.locomotion.place(np.array([robot]), xy, np.array([yaw]), np.zeros(1))
+
+
+# ------------------------------------------------------------------ Gymnasium's face
+
+
+@pytest.mark.parametrize("config", [PLANE, TILES], ids=["plane", "tiles"])
+def test_both_env_checkers(config: LowLevelConfig) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*(action space|Box observation|infinity).*")
+        env = gym.make("tdgc/LowLevel-v0", config=config)
+        check_env(env.unwrapped)
+        sb3_check_env(env.unwrapped)
+        env.close()
+
+
+def test_the_registered_environment() -> None:
+    env = gym.make("tdgc/LowLevel-v0")
+    assert isinstance(env.unwrapped, LowLevelEnv)
+    assert env.unwrapped.config == LowLevelConfig()
+    assert env.observation_space.shape == (109,) and env.observation_space.dtype == np.float32
+    assert isinstance(env.action_space, gym.spaces.Box)
+    assert env.action_space.low.tolist() == [-6.0] * 12
+    assert env.action_space.high.tolist() == [6.0] * 12
+    env.close()
+
+
+def test_a_seed_fixes_an_episode() -> None:
+    env = LowLevelEnv(PLANE)
+
+    def episode(seed: int) -> Array:
+        first, info = env.reset(seed=seed)
+        assert info == {}
+        return np.array([first] + [env.step(np.full(12, 0.3))[0] for _ in range(5)])
+
+    one = episode(1)
+    assert (episode(1) == one).all()
+    assert (episode(2) != one).any()
+    env.close()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_action_that_is_not_finite(value: float) -> None:
+    env = LowLevelEnv(PLANE)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^an action must be finite; it has NaN or infinite"):
+        env.step(np.full(12, value, dtype=np.float32))
+    env.close()
+
+
+# ------------------------------------------------------------------ observation
+
+
+def test_observation_of_actor_and_critic() -> None:
+    task = LowLevelTask(PLANE, 3, seed=0)
+    assert task.actor_dim == 71
+    assert task.obs_dim == 71 + sum(size for _, size in CRITIC_LAYOUT) == 109
+    task.reset(np.arange(3))
+    assert task.observe().shape == (3, 109) and task.observe().dtype == np.float32
+    task.close()
+    task = LowLevelTask(dataclasses.replace(PLANE, gyro=True), 1, seed=0)
+    assert task.actor_dim == 74 and task.obs_dim == 112
+    task.close()
+
+
+def test_only_the_actor_has_noise_and_only_in_training() -> None:
+    task = begin(PLANE, 2, training=True)
+    first, second = task.observe(), task.observe()
+    assert (first[:, :27] != second[:, :27]).all()
+    assert (first[:, 27:] == second[:, 27:]).all()
+    task.close()
+    task = begin(PLANE, 2)
+    assert (task.observe() == task.observe()).all()
+    task.close()
+
+
+def critic(task: LowLevelTask) -> dict[str, Array]:
+    rows, parts, start = task.observe(), {}, task.actor_dim
+    for name, size in CRITIC_LAYOUT:
+        parts[name] = rows[:, start : start + size]
+        start += size
+    assert start == task.obs_dim
+    return parts
+
+
+def test_what_the_critic_sees_of_a_known_state() -> None:
+    """Facing left, going forward, turning left, 5 cm high, one foot up, weak and loaded."""
+    task = begin(PLANE)
+    loco, state = task.locomotion, task.locomotion.world.state
+    state.position[0] = [3.0, 1.0, 0.35]
+    state.quaternion[:] = yaw_quaternion(np.array([math.pi / 2]))
+    state.lin_vel[0], state.ang_vel[0] = [-0.2, 0.6, 0.1], [0.0, 0.4, 0.8]
+    state.q[0] = [0.0, 0.7, -1.4] * 4
+    state.derive()
+    state.foot_force[0] = [0.0, 0.9, 1.1, 60.0]
+    loco.friction[:], loco.payload[:], loco.delay[:] = 0.5, 1.5, 0.015
+    loco.world.strength[:] = 0.9
+    task._ground = task._measure_ground()
+    seen = critic(task)
+    np.testing.assert_allclose(seen["velocity"], [[1.2, 0.4, 0.2]], atol=1e-6)
+    np.testing.assert_allclose(seen["angular_velocity"], [[0.1, 0.0, 0.2]], atol=1e-6)
+    np.testing.assert_allclose(seen["base_height"], [[0.5]], atol=1e-6)
+    height = 0.35 - 2 * 0.213 * math.cos(0.7)
+    np.testing.assert_allclose(seen["foot_height"], [[10 * height] * 4], atol=1e-5)
+    assert seen["foot_contact"].tolist() == [[0.0, 0.0, 1.0, 1.0]]
+    np.testing.assert_allclose(seen["dynamics"], [[0.5, 0.5, -0.5, 0.5]], atol=1e-6)
+    np.testing.assert_allclose(seen["terrain"], [[-0.25] * 15], atol=1e-6)
+    np.testing.assert_allclose(seen["desired_contact"], loco.clock.contact, atol=1e-6)
+    task.close()
+
+
+def test_the_critic_sees_a_step_ahead() -> None:
+    """A riser 0.4 m ahead of the trunk is under the front probes only, in any heading."""
+    task = begin(TILES)
+    assert task.field is not None
+    field, n = task.field, 161
+    field.heights[:] = field.support[:] = 0.0
+    field.heights[round(4.0 / 0.05) + 1 : n] = 0.1
+    task.locomotion.world.upload_terrain()
+    for yaw, ahead in ((0.0, True), (math.pi, False)):
+        put(task, 0, (3.65, 4.0), yaw)
+        task._ground = task._measure_ground()
+        probes = critic(task)["terrain"].reshape(5, 3)
+        lift = 0.5 if ahead else 0.0
+        standing = 5 * (task.locomotion.world.state.position[0, 2] - 0.30)
+        np.testing.assert_allclose(probes[:4], -standing, atol=1e-5)
+        np.testing.assert_allclose(probes[4], lift - standing, atol=1e-5)
+    task.close()
+
+
+def test_reset_gives_a_fresh_observation() -> None:
+    """What is left of a fall does not show in the first observation after it."""
+    task = begin(PLANE)
+    fresh = {k: v.copy() for k, v in critic(task).items()}
+    task.locomotion.world.strength[:] = 0.0
+    for _ in range(30):
+        task.step(still(task))
+    assert abs(critic(task)["base_height"][0, 0] - fresh["base_height"][0, 0]) > 0.5
+    task.locomotion.world.strength[:] = 1.0
+    task.reset(np.arange(1))
+    again = critic(task)
+    for name in ("velocity", "base_height", "foot_height", "foot_contact", "dynamics", "terrain"):
+        np.testing.assert_allclose(again[name], fresh[name], atol=1e-5, err_msg=name)
+    task.close()
+
+
+# ------------------------------------------------------------------ reward
+
+
+def test_reward_of_a_step_is_that_of_its_terms() -> None:
+    task = begin(PLANE, 2)
+    before = task.locomotion.world.state.qd.copy()
+    actions = np.random.default_rng(0).normal(size=(2, 12))
+    reward, _, _ = task.step(actions)
+    stats, weights = task.take_stats(), PLANE.rewards
+    terms = {key[5:]: value for key, value in stats.items() if key.startswith("term/")}
+    state = task.locomotion.world.state
+    change = (state.qd - before) / 0.02
+    assert np.abs(change).max() > 1.0
+    expected = weights.joint_accelerations * (change**2).sum()
+    assert terms["joint_accelerations"] == pytest.approx(expected)
+    assert terms["action_rate"] == pytest.approx(weights.action_rate * (actions**2).sum())
+    moved = actions * np.tile([0.125, 0.25, 0.25], 4)
+    assert terms["target_rate"] == pytest.approx(weights.target_rate * (moved**2).sum())
+    assert terms["joint_torques"] == pytest.approx(weights.joint_torques * (state.torque**2).sum())
+    assert stats["reward"] == pytest.approx(reward.sum())
+    assert (reward > 0.0).all() and (reward < 0.03).all()
+    # The sum: two robots alike would make the sum of the terms that of one.
+    task.close()
+    task = begin(PLANE)
+    reward, _, _ = task.step(actions[:1])
+    terms = {k[5:]: v for k, v in task.take_stats().items() if k.startswith("term/")}
+    earned = terms.pop("track_lin_vel") + terms.pop("track_yaw_rate")
+    assert reward[0] == pytest.approx(0.02 * earned * math.exp(sum(terms.values())))
+    task.close()
+
+
+def test_statistics_of_a_run() -> None:
+    task = begin(PLANE, 4)
+    for _ in range(3):
+        task.step(still(task))
+    sums = task.take_stats()
+    assert sums["steps"] == 12 and sums["episodes"] == 4 and sums["falls"] == 0
+    steps = [sums[f"gait/{gait}/steps"] for gait in ("trot", "pronk", "pace", "bound")]
+    assert sum(steps) == 12
+    task.step(still(task))
+    assert task.take_stats()["steps"] == 4  # only what came since
+    values = summarise({**sums, "workers": 1.0, "falls": 3.0})
+    assert values["reward/total"] == pytest.approx(sums["reward"] / 12)
+    assert values["falls_per_minute"] == pytest.approx(3 / (12 * 0.02 / 60))
+    assert values["command_share/trot"] == 1.0
+    gait = ("trot", "pronk", "pace", "bound")[int(np.argmax(steps))]
+    rmse = math.sqrt(sums[f"gait/{gait}/lin"] / max(steps))
+    assert values[f"tracking/{gait}_velocity_rmse"] == pytest.approx(rmse)
+    assert 0.0 <= values[f"tracking/{gait}_contact_match"] <= 1.0
+    task.close()
+
+
+# ------------------------------------------------------------------ how episodes end
+
+
+class Ground:
+    """A world of states only: the ground is 1 m high."""
+
+    def __init__(self, heights: list[float], forces: list[float]) -> None:
+        self.state = RobotState.zeros(len(heights))
+        self.state.position[:, 2] = heights
+        self.state.trunk_force[:] = forces
+
+    def support_height(self, x: Array, y: Array) -> Array:
+        return np.ones_like(x)
+
+
+def test_fall_rule() -> None:
+    world: Any = Ground([1.3, 1.151, 1.149, 1.3, 1.3, 0.5], [0.0, 0.0, 0.0, 40.0, 40.1, 0.0])
+    assert is_fallen(world).tolist() == [False, False, True, False, True, True]
+
+
+def test_a_robot_without_strength_falls() -> None:
+    task = begin(PLANE, 2)
+    task.locomotion.world.strength[1] = 0.0
+    ends = np.zeros(2, dtype=int)
+    for k in range(1, 61):
+        _, terminated, truncated = task.step(still(task))
+        assert not truncated.any()
+        ends = np.where((ends == 0) & terminated, k, ends)
+    assert ends[0] == 0 and 5 < ends[1] < 60
+    task.close()
+
+
+def test_a_robot_on_its_back_has_failed() -> None:
+    task = begin(PLANE)
+    upside_down = np.array([pybullet.getQuaternionFromEuler([math.pi, 0.0, 0.0])])
+    position = np.array([[0.0, 0.0, 0.4]])
+    task.locomotion.world.reset_robots([0], position, upside_down, NOMINAL[None])
+    ended = [bool(task.step(still(task))[1][0]) for _ in range(15)]
+    assert ended[0] is False and ended[-1] is True
+    task.close()
+
+
+def test_a_robot_in_a_trench_has_failed_and_one_on_a_step_has_not() -> None:
+    task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 2)
+    assert task.field is not None
+    for row, family in enumerate(("gap", "stair")):
+        task.field.place(row, 0, make_tile(family, 1.0, np.random.default_rng(0)))
+    world = task.locomotion.world
+    trench = np.argwhere(task.field.heights[:161, 40] < -0.5)[0, 0] * 0.05
+    stairs = 161 * 0.05 + 4.0
+    state = world.state
+    state.position[:] = [[trench, 2.0, 0.14], [stairs, 2.0, 1.04 + 0.3]]
+    assert world.ground_height(np.array([trench]), np.array([2.0]))[0] < -0.5
+    assert world.support_height(np.array([stairs]), np.array([2.0]))[0] == pytest.approx(1.04)
+    assert is_fallen(world).tolist() == [True, False]
+    state.position[:, 2] += [0.02, -0.16]
+    assert is_fallen(world).tolist() == [False, True]
+    task.close()
+
+
+def test_twenty_seconds_and_no_more() -> None:
+    task = begin(PLANE, 2)
+    assert task.horizon == 1000
+    task.elapsed[:] = [998, 500]
+    _, terminated, truncated = task.step(still(task))
+    assert not terminated.any() and not truncated.any()
+    _, terminated, truncated = task.step(still(task))
+    assert not terminated.any() and truncated.tolist() == [True, False]
+    task.reset(np.array([0]))
+    assert task.elapsed.tolist() == [0, 502]
+    task.close()
+
+
+def test_a_fall_at_the_last_step_is_a_fall() -> None:
+    task = begin(PLANE)
+    task.locomotion.world.strength[:] = 0.0
+    for _ in range(60):
+        task.elapsed[:] = 998
+        _, terminated, truncated = task.step(still(task))
+        if terminated[0]:
+            break
+    task.elapsed[:] = 999
+    _, terminated, truncated = task.step(still(task))
+    assert terminated.tolist() == [True] and truncated.tolist() == [False]
+    task.close()
+
+
+@pytest.mark.parametrize("spot", [(0.01, 4.0), (7.99, 4.0), (0.75, 2.01), (0.75, 5.99)])
+def test_leaving_the_tile_truncates(spot: tuple[float, float]) -> None:
+    """Training tiles are 4 m wide; robots are pushed out over each border."""
+    task = begin(dataclasses.replace(TILES, families=("stair",)), 2)
+    put(task, 1, spot)
+    out = np.sign(np.array(spot) - [4.0, 4.0]) * (np.abs(np.array(spot) - 4.0) > [3.9, 1.9])
+    task.locomotion.world.push([1], np.array([[*(out * 1.5), 0.0]]))
+    _, terminated, truncated = task.step(still(task))
+    assert not terminated.any() and truncated.tolist() == [False, True]
+    task.close()
+
+
+# ------------------------------------------------------------------ commands and pushes
+
+
+def test_commands_are_drawn_anew_every_five_seconds() -> None:
+    task = begin(PLANE, 3)
+    task.elapsed[:] = [0, 248, 100]
+    first = task.locomotion.command.copy()
+    task.step(still(task))
+    assert (task.locomotion.command == first).all()
+    task.step(still(task))  # the second robot is 250 steps old
+    changed = (task.locomotion.command != first).any(axis=1)
+    assert changed.tolist() == [False, True, False]
+    task.step(still(task))
+    assert (task.locomotion.command[[0, 2]] == first[[0, 2]]).all()
+    task.close()
+
+
+def test_a_reset_leaves_the_other_robots_alone() -> None:
+    """Even those whose commands were drawn in this very step."""
+    task = begin(PLANE, 3, training=True)
+    task.elapsed[:] = [10, 249, 500]
+    task.step(still(task))
+    command, elapsed = task.locomotion.command.copy(), task.elapsed.copy()
+    speed = task.locomotion.world.state.lin_vel.copy()
+    task.reset(np.array([0]))
+    assert (task.locomotion.command[1:] == command[1:]).all()
+    assert (task.locomotion.command[0] != command[0]).any()
+    assert (task.elapsed[1:] == elapsed[1:]).all() and task.elapsed[0] == 0
+    assert (task.locomotion.world.state.lin_vel[1:] == speed[1:]).all()
+    task.close()
+
+
+def test_no_commands_are_drawn_when_the_interval_is_none() -> None:
+    task = begin(dataclasses.replace(PLANE, command_seconds=0.0))
+    first = task.locomotion.command.copy()
+    for elapsed in (249, 250, 499):
+        task.elapsed[:] = elapsed
+        task.step(still(task))
+    assert (task.locomotion.command == first).all()
+    task.close()
+
+
+def test_commands_fill_their_ranges() -> None:
+    task = LowLevelTask(PLANE, 1, seed=0, training=False)
+    bounds = np.array(dataclasses.astuple(PLANE.commands))
+    drawn = []
+    for _ in range(600):
+        task._draw_commands(np.arange(1))
+        drawn.append(task.locomotion.command[0].copy())
+    values = np.array(drawn)
+    width = bounds[:, 1] - bounds[:, 0]
+    assert (values[:, :12] >= bounds[:, 0]).all() and (values[:, :12] <= bounds[:, 1]).all()
+    assert (values[:, :12].min(axis=0) < bounds[:, 0] + 0.05 * width).all()
+    assert (values[:, :12].max(axis=0) > bounds[:, 1] - 0.05 * width).all()
+    standing = (values[:, :3] == 0.0).all(axis=1).mean()
+    assert 0.05 < standing < 0.16
+    assert np.bincount(gait_index(values), minlength=4).min() > 100
+    task.close()
+
+
+def test_training_begins_with_a_share_of_the_velocity_ranges() -> None:
+    config = dataclasses.replace(PLANE, command_start=0.25)
+    task = LowLevelTask(config, 1, seed=0)
+    assert task.command_share.tolist() == [0.25] * 4
+    task.command_share[2] = 1.0
+    drawn = []
+    for _ in range(400):
+        task._draw_commands(np.arange(1))
+        drawn.append(task.locomotion.command[0].copy())
+    values = np.array(drawn)
+    paces = gait_index(values) == 2
+    assert np.abs(values[~paces, 0]).max() <= 0.25 and np.abs(values[paces, 0]).max() > 0.7
+    assert np.abs(values[:, INDEX["body_height"]]).max() > 0.09  # others have their full range
+    task.close()
+
+
+def test_velocity_ranges_grow_for_a_gait_that_does_well() -> None:
+    task = LowLevelTask(dataclasses.replace(PLANE, command_start=0.4), 4, seed=0)
+    weights = PLANE.rewards
+    columns = task._gait_scores.shape[1]
+    perfect = np.array([1.0, weights.track_lin_vel, weights.track_yaw_rate, 1.0])[:columns]
+    task._gait_scores[:] = [1000 * perfect, 0 * perfect, 10 * perfect, 1000 * perfect]
+    task._gait_scores[3, 1] *= 0.3  # bad at following velocities
+    task._grow_commands()
+    np.testing.assert_allclose(task.command_share, [0.45, 0.4, 0.4, 0.4], atol=1e-12)
+    assert (task._gait_scores[[0, 3]] == 0.0).all() and task._gait_scores[2, 0] == 10
+    task.command_share[0] = 0.98
+    task._gait_scores[0] = 1000 * perfect
+    task._grow_commands()
+    assert task.command_share[0] == 1.0
+    task.close()
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0, -2.5])
+def test_a_crossing_robot_is_sent_to_its_waypoint(yaw: float) -> None:
+    task = begin(TILES, 2)
+    assert task.field is not None
+    task._crossing[:] = [True, False]
+    put(task, 0, (2.0, 3.5), yaw)
+    free = task.locomotion.command[1].copy()
+    task._speed[:], task._facing[:] = 0.5, 0.4
+    origin = task.field.origin(0, 0)
+    task._waypoint[0] = origin + [7.25, 4.5]
+    task._steer_crossings()
+    vx, vy, turning = task.locomotion.command[0, :3]
+    c, s = math.cos(yaw), math.sin(yaw)
+    world = np.array([c * vx - s * vy, s * vx + c * vy])
+    bearing = math.atan2(1.0, 5.25)
+    np.testing.assert_allclose(
+        world / np.linalg.norm(world), [math.cos(bearing), math.sin(bearing)], atol=1e-9
+    )
+    assert np.linalg.norm(world) == pytest.approx(0.5, abs=1e-9)
+    error = (bearing + 0.4 - yaw + math.pi) % (2 * math.pi) - math.pi
+    assert turning == pytest.approx(min(1.0, max(-1.0, error)), abs=1e-9)
+    assert (task.locomotion.command[1] == free).all()
+    task.close()
+
+
+def test_crossing_velocities_keep_their_direction_within_the_ranges() -> None:
+    """Going sideways at 1 m/s is asked for at the 0.6 m/s that vy allows."""
+    task = begin(TILES)
+    assert task.field is not None
+    task._crossing[:], task._facing[:], task._speed[:] = True, 0.0, 1.0
+    put(task, 0, (2.0, 4.0), -math.pi / 2)
+    task._waypoint[0] = task.field.origin(0, 0) + [7.25, 4.0]
+    task._steer_crossings()
+    np.testing.assert_allclose(task.locomotion.command[0, :3], [0.0, 0.6, 1.0], atol=1e-9)
+    put(task, 0, (2.0, 4.0), -math.pi / 4)
+    task._steer_crossings()
+    np.testing.assert_allclose(task.locomotion.command[0, :2], [0.6, 0.6], atol=1e-9)
+    task.close()
+
+
+def test_a_robot_that_arrives_is_sent_back() -> None:
+    task = begin(TILES)
+    assert task.field is not None
+    task._crossing[:] = True
+    origin = task.field.origin(0, 0)
+    task._waypoint[0] = origin + [7.25, 4.4]
+    put(task, 0, (6.7, 4.4))
+    task._steer_crossings()
+    assert not task._reached[0]
+    put(task, 0, (6.8, 4.4))
+    task._steer_crossings()
+    assert task._reached[0]
+    np.testing.assert_allclose(task._waypoint[0], origin + [0.75, 4.4], atol=1e-9)
+    assert task.locomotion.command[0, 0] < 0.0
+    task.close()
+
+
+def test_crossing_robots_face_where_they_are_asked_to() -> None:
+    """So that the first command asks for no more than a small turn."""
+    task = LowLevelTask(TILES, 10, seed=3, training=False)
+    task.reset(np.arange(10))
+    crossing = task._crossing
+    assert 0.5 < crossing.mean() <= 1.0
+    turning = np.abs(task.locomotion.command[crossing, INDEX["yaw_rate"]])
+    assert turning.max() < 0.85  # 0.5 rad of the start's yaw, 0.3 of the goal's bearing
+    task.close()
+
+
+class Pushes:
+    """Notes the pushes of a world and lets them happen."""
+
+    def __init__(self, task: LowLevelTask) -> None:
+        self.task, self.seen = task, []  # type: ignore[var-annotated]
+        self._push = task.locomotion.world.push
+        task.locomotion.world.push = self.record  # type: ignore[method-assign]
+
+    def record(self, index: Array, velocity: Array) -> None:
+        self.seen += [(int(i), int(self.task.elapsed[i]), v.copy()) for i, v in
+                      zip(index, velocity, strict=True)]  # fmt: skip
+        self._push(index, velocity)
+
+
+def test_pushes_come_at_their_interval() -> None:
+    quiet = RandomisationConfig(push_interval=(0.5, 0.5), push_speed=0.6)
+    task = begin(dataclasses.replace(PLANE, randomisation=quiet), 2, training=True)
+    pushes = Pushes(task)
+    for _ in range(80):
+        task.step(still(task))
+    assert [(i, step) for i, step, _ in pushes.seen] == [
+        (0, 25), (1, 25), (0, 50), (1, 50), (0, 75), (1, 75)
+    ]  # fmt: skip
+    velocity = np.array([v for _, _, v in pushes.seen])
+    speed = np.linalg.norm(velocity, axis=1)
+    assert (velocity[:, 2] == 0.0).all() and (speed <= 0.6).all() and (speed > 0.0).all()
+    assert len(np.unique(velocity[:, 0])) == 6
+    task.close()
+
+
+def test_no_pushes_outside_training_and_none_felt_at_scale_zero() -> None:
+    often = RandomisationConfig(push_interval=(0.1, 0.1))
+    task = begin(dataclasses.replace(PLANE, randomisation=often))
+    pushes = Pushes(task)
+    for _ in range(10):
+        task.step(still(task))
+    assert pushes.seen == []
+    task.close()
+    off = dataclasses.replace(often, scale=0.0)
+    task = begin(dataclasses.replace(PLANE, randomisation=off), training=True)
+    pushes = Pushes(task)
+    for _ in range(10):
+        task.step(still(task))
+    assert pushes.seen and all((v == 0.0).all() for _, _, v in pushes.seen)
+    task.close()
+
+
+# ------------------------------------------------------------------ levels
+
+
+def test_each_robot_has_a_tile_of_its_family_and_level() -> None:
+    task = LowLevelTask(TILES, 5, seed=7)
+    assert task.field is not None
+    assert task.column.tolist() == [0, 1, 2, 3, 0]
+    assert (task.level >= 0).all() and (task.level < 3).all()
+    for i, family in enumerate(("rough", "stair", "gap", "tilt", "rough")):
+        level = int(task.level[i])
+        tile = make_tile(family, level / 10, tile_rng(7, family, level, i))
+        crop = slice(40, 121)  # 2 m at either side
+        assert (task.field.heights[161 * i : 161 * (i + 1)] == tile.heights[:, crop]).all()
+    task.close()
+
+
+def ended(
+    local_x: float, *, reached: bool = False, crossing: bool = True, level: int = 5,
+    elapsed: int = 999, began: int = 0, falls: bool = False, training: bool = True,
+) -> int:  # fmt: skip
+    """Level of a robot after a step that ends its episode, unless ``elapsed`` says otherwise."""
+    quiet = RandomisationConfig(scale=0.0)
+    config = dataclasses.replace(TILES, families=("stair",), randomisation=quiet)
+    task = LowLevelTask(config, 1, seed=0, training=training)
+    assert task.field is not None
+    task.field.place(0, 0, make_tile("tilt", 0.0, np.random.default_rng(0)))
+    task.locomotion.world.upload_terrain()
+    task.reset(np.arange(1))
+    put(task, 0, (local_x, 4.0))
+    if falls:
+        upside_down = np.array([[1.0, 0.0, 0.0, 0.0]])
+        position = task.locomotion.world.state.position.copy()
+        position[0, 2] = 0.1
+        task.locomotion.world.reset_robots([0], position, upside_down, NOMINAL[None])
+    task._crossing[:], task._reached[:] = crossing, reached
+    task.level[:], task.elapsed[:], task._began[:] = level, elapsed, began
+    _, terminated, _ = task.step(still(task))
+    assert bool(terminated[0]) == falls
+    level = int(task.level[0])
+    task.close()
+    return level
+
+
+def test_promotion() -> None:
+    assert ended(2.0, reached=True) == 6
+    assert ended(2.0, reached=True, falls=True, elapsed=600) == 6
+    assert ended(2.0, reached=True, crossing=False) == 5
+    assert ended(2.0, reached=True, elapsed=500) == 5  # the episode goes on
+    assert ended(2.0, reached=True, training=False) == 5
+
+
+def test_demotion() -> None:
+    assert ended(3.9) == 4
+    assert ended(4.1) == 5  # more than half of the way
+    assert ended(3.9, elapsed=500) == 5
+    assert ended(3.9, elapsed=500, falls=True) == 4
+    assert ended(4.1, elapsed=500, falls=True) == 5
+    assert ended(3.9, crossing=False) == 5
+    assert ended(3.9, level=0) == 0
+
+
+def test_half_an_episode_is_no_reason_for_demotion() -> None:
+    """After ``restart`` episodes begin at any age; those cut short say nothing of a level."""
+    assert ended(3.9, began=600) == 5
+    assert ended(3.9, began=600, falls=True) == 4
+    assert ended(2.0, began=600, reached=True) == 6
+
+
+def test_beyond_the_last_level_any_level_follows() -> None:
+    assert ended(2.0, reached=True, level=9) == 10
+    assert 0 <= ended(2.0, reached=True, level=10) <= 10
+
+
+def test_leaving_a_tile_early_neither_promotes_nor_demotes() -> None:
+    assert ended(-0.01, elapsed=500) == 5
+
+
+# ------------------------------------------------------------------ restart and resume
+
+
+def live(task: LowLevelTask, steps: int) -> Array:
+    """(steps, M, n) of observations, rewards and flags, with resets as a worker does them."""
+    rng, rows = np.random.default_rng(1), []
+    for _ in range(steps):
+        reward, terminated, truncated = task.step(rng.normal(0.0, 1.5, (task.num_robots, 12)))
+        seen = task.observe()
+        done = np.flatnonzero(terminated | truncated)
+        if done.size:
+            task.reset(done)
+            seen[done] = task.observe()[done]
+        rows.append(np.column_stack([seen, reward, terminated, truncated]))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("config", [PLANE, TILES], ids=["plane", "tiles"])
+def test_a_restart_from_a_state_has_the_same_future(config: LowLevelConfig) -> None:
+    config = dataclasses.replace(config, episode_seconds=1.0)  # some end on the way
+    task = LowLevelTask(config, 3, seed=5)
+    task.restart()
+    live(task, 40)
+    task.level[:] = [3, 1, 0]
+    task.command_share[1] = 0.65
+    state = json.loads(json.dumps(task.state_dict()))
+    task.restart()
+    expected = task.observe(), live(task, 60)
+    assert (expected[1][..., -2:] == 1.0).any()
+    other = LowLevelTask(config, 3, seed=5)
+    other.load_state_dict(state)
+    other.restart()
+    np.testing.assert_array_equal(other.observe(), expected[0])
+    np.testing.assert_array_equal(live(other, 60), expected[1])
+    assert other.state_dict() == task.state_dict()
+    assert other.command_share[1] == pytest.approx(0.65)
+    task.close()
+    other.close()
+
+
+def test_restart_draws_new_tiles_at_the_present_levels() -> None:
+    config = dataclasses.replace(TILES, families=("stair",))
+    task = LowLevelTask(config, 2, seed=0)
+    task.restart()
+    assert task.field is not None
+    task.level[:] = [2, 8]
+    task.restart()
+    rises = [np.diff(task.field.heights[161 * i : 161 * (i + 1), 0]).max() for i in (0, 1)]
+    np.testing.assert_allclose(rises, [0.05, 0.11], atol=1e-6)
+    rays = task.locomotion.world.ground_height(np.array([4.0, 12.05]), np.array([2.0, 2.0]))
+    np.testing.assert_allclose(rays, [8 * 0.05, 8 * 0.11], atol=1e-5)
+    task.close()
+
+
+def test_restart_spreads_the_ends_of_episodes() -> None:
+    task = LowLevelTask(PLANE, 10, seed=0)
+    task.restart()
+    assert task.elapsed.min() < 250 and task.elapsed.max() > 750
+    assert (task._began == task.elapsed).all()
+    assert (task._next_push > task.elapsed).all()
+    task.close()
+
+
+def test_seeds_differ() -> None:
+    first, second = (LowLevelTask(PLANE, 2, seed=seed) for seed in (0, 1))
+    for task in (first, second):
+        task.restart()
+    assert (first.observe() != second.observe()).any()
+    first.close()
+    second.close()
+
+
+def test_constants_of_the_paper() -> None:
+    assert (low_env.FALL_HEIGHT, low_env.TRUNK_FORCE, low_env.GOAL_RADIUS) == (0.15, 40.0, 0.5)

@@ -1,0 +1,256 @@
+"""Worker processes: what they compute is what the tasks compute, and how they fail."""
+
+import functools
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from tdgc.config import LowLevelConfig, PhysicsConfig
+from tdgc.low_env import LowLevelTask
+from tdgc.robot import Array
+from tdgc.vec import TaskVecEnv, WorkerError, worker_seed
+
+CONFIG = LowLevelConfig(episode_seconds=0.5, physics=PhysicsConfig(substeps=4))
+
+
+def make_robots(robots: int, seed: int) -> LowLevelTask:
+    return LowLevelTask(CONFIG, robots, seed)
+
+
+class Counter:
+    """Robot i of n ends every i + 2 steps: terminated if i is even, truncated otherwise.
+
+    It sees its own number, the steps of its episode, and the last reward, which is the sum of
+    its actions.
+    """
+
+    actor_dim = 3
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self, robots: int, seed: int, fails: str = "") -> None:
+        if fails == "start":
+            raise RuntimeError("no robot to be had")
+        self.num_robots, self.seed, self.fails = robots, seed, fails
+        self.steps = np.zeros(robots)
+        self.sums = np.zeros(robots)
+        self.restarts = 0
+
+    def reset(self, index: Any) -> None:
+        self.steps[index] = self.sums[index] = 0.0
+
+    def step(self, actions: Any) -> tuple[Array, Any, Any]:
+        if self.fails == "step" and actions[0, 0] == 1.0:
+            raise ValueError("the ground is gone")
+        self.steps += 1
+        self.sums = actions.sum(axis=1, dtype=np.float64)
+        number = np.arange(self.num_robots)
+        done = self.steps >= number + 2
+        return self.sums.copy(), done & (number % 2 == 0), done & (number % 2 == 1)
+
+    def observe(self) -> Any:
+        number = np.arange(self.num_robots)
+        return np.stack([number, self.steps, self.sums], axis=1).astype(np.float32)
+
+    def restart(self) -> None:
+        self.restarts += 1
+        self.reset(np.arange(self.num_robots))
+
+    def take_stats(self) -> dict[str, float]:
+        return {"robots": float(self.num_robots), "restarts": float(self.restarts)}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"seed": self.seed, "restarts": self.restarts}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.restarts = state["restarts"]
+
+    def close(self) -> None:
+        pass
+
+
+def make_counter(robots: int, seed: int) -> Counter:
+    return Counter(robots, seed)
+
+
+def make_failing(where: str, robots: int, seed: int) -> Counter:
+    return Counter(robots, seed, fails=where)
+
+
+SPACES = (Counter.observation_space, Counter.action_space)
+
+
+@pytest.fixture(scope="module")
+def counters() -> Iterator[TaskVecEnv]:
+    """Five robots in two workers, two and three."""
+    env = TaskVecEnv(make_counter, 5, 2, seed=3, spaces=SPACES)
+    yield env
+    env.close()
+
+
+def test_workers_compute_what_the_tasks_do() -> None:
+    """Two workers with two robots each, through the ends of episodes, to the last bit."""
+    tasks = [make_robots(2, worker_seed(7, k)) for k in range(2)]
+    spaces = tasks[0].observation_space, tasks[0].action_space
+    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
+    observation = env.reset()
+    for task in tasks:
+        task.restart()
+    np.testing.assert_array_equal(observation, np.concatenate([t.observe() for t in tasks]))
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(40):
+        actions = rng.normal(size=(4, 12)).astype(np.float32)
+        observation, rewards, dones, infos = env.step(actions)
+        for k, task in enumerate(tasks):
+            mine = slice(2 * k, 2 * k + 2)
+            reward, terminated, truncated = task.step(actions[mine])
+            last = task.observe()
+            done = terminated | truncated
+            expected = last.copy()
+            if done.any():
+                task.reset(np.flatnonzero(done))
+                expected[done] = task.observe()[done]
+            np.testing.assert_array_equal(observation[mine], expected)
+            np.testing.assert_array_equal(rewards[mine], reward.astype(np.float32))
+            np.testing.assert_array_equal(dones[mine], done)
+            for i in np.flatnonzero(done):
+                info = infos[2 * k + i]
+                np.testing.assert_array_equal(info["terminal_observation"], last[i])
+                assert info["TimeLimit.truncated"] == truncated[i]
+                ends += 1
+    assert ends > 2
+    states = env.state_dicts()
+    assert json.loads(json.dumps(states)) == [task.state_dict() for task in tasks]
+    # Loading them into other workers gives the same future.
+    for task in tasks:
+        task.close()
+    observation = env.reset()
+    futures = [observation, *(env.step(np.full((4, 12), 0.1))[0] for _ in range(3))]
+    env.load_state_dicts(states)
+    again = [env.reset(), *(env.step(np.full((4, 12), 0.1))[0] for _ in range(3))]
+    np.testing.assert_array_equal(again, futures)
+    env.close()
+
+
+def test_ends_of_episodes(counters: TaskVecEnv) -> None:
+    """Numbers within a worker are 0, 1 and 0, 1, 2; they end after 2, 3 and 2, 3, 4 steps."""
+    first = counters.reset()
+    assert first.tolist() == [[i, 0.0, 0.0] for i in (0, 1, 0, 1, 2)]
+    assert first.dtype == np.float32
+    actions = np.arange(10, dtype=np.float32).reshape(5, 2) / 10
+    sums = actions.sum(axis=1)
+    observation, rewards, dones, infos = counters.step(actions)
+    np.testing.assert_allclose(rewards, sums, rtol=1e-6)
+    assert not dones.any() and infos == [{}] * 5
+    assert observation[:, 1].tolist() == [1.0] * 5
+    kept = observation.copy()
+    observation, _, dones, infos = counters.step(actions)
+    assert dones.tolist() == [True, False, True, False, False]
+    assert observation[:, 1].tolist() == [0.0, 2.0, 0.0, 2.0, 2.0]
+    for i in (0, 2):
+        assert infos[i]["terminal_observation"].tolist() == [0.0, 2.0, pytest.approx(sums[i])]
+        assert infos[i]["TimeLimit.truncated"] is False
+        assert infos[i]["episode"] == {"r": pytest.approx(2 * sums[i]), "l": 2}
+    assert infos[1] == infos[3] == infos[4] == {}
+    _, _, dones, infos = counters.step(actions)
+    assert dones.tolist() == [False, True, False, True, False]
+    assert infos[1]["TimeLimit.truncated"] is True and infos[1]["episode"]["l"] == 3
+    _, _, dones, infos = counters.step(2 * actions)
+    assert dones.tolist() == [True, False, True, False, True]
+    assert infos[4]["TimeLimit.truncated"] is False
+    assert infos[4]["episode"] == {"r": pytest.approx(5 * sums[4]), "l": 4}
+    assert infos[0]["episode"]["r"] == pytest.approx(3 * sums[0])
+    # What was handed out is the caller's own.
+    assert (kept[:, 1] == 1.0).all()
+    assert infos[4]["terminal_observation"][1] == 4.0
+
+
+def test_reset_begins_all_returns_anew(counters: TaskVecEnv) -> None:
+    counters.reset()
+    counters.step(np.ones((5, 2), dtype=np.float32))
+    counters.reset()
+    counters.step(np.zeros((5, 2), dtype=np.float32))
+    _, _, _, infos = counters.step(np.zeros((5, 2), dtype=np.float32))
+    assert infos[0]["episode"] == {"r": 0.0, "l": 2}
+
+
+def test_statistics_and_states_of_each_worker(counters: TaskVecEnv) -> None:
+    stats = counters.stats()
+    assert [s["robots"] for s in stats] == [2.0, 3.0]
+    assert all(s["busy_seconds"] > 0.0 for s in stats)
+    states = counters.state_dicts()
+    assert [s["seed"] for s in states] == [worker_seed(3, 0), worker_seed(3, 1)]
+    counters.load_state_dicts([{"restarts": 50}, {"restarts": 60}])
+    counters.reset()
+    assert [s["restarts"] for s in counters.stats()] == [51.0, 61.0]
+    with pytest.raises(ValueError, match=r"^states of 1 workers do not fit 2$"):
+        counters.load_state_dicts(states[:1])
+
+
+def test_what_a_batched_world_cannot_answer(counters: TaskVecEnv) -> None:
+    assert counters.num_envs == 5
+    assert counters.get_attr("num_envs", [0, 3]) == [5, 5]
+    assert counters.env_is_wrapped(gym.Wrapper) == [False] * 5
+    with pytest.raises(NotImplementedError):
+        counters.set_attr("x", 1)
+    with pytest.raises(NotImplementedError):
+        counters.env_method("reset")
+
+
+def test_a_terminals_interrupt_is_the_parents_to_answer(counters: TaskVecEnv) -> None:
+    for pid in counters.worker_pids:
+        os.kill(pid, signal.SIGINT)
+    assert counters.reset().shape == (5, 3)
+    assert all(process.is_alive() for process in counters._processes)
+
+
+@pytest.mark.parametrize("workers", [0, 4, -1])
+def test_number_of_workers(workers: int) -> None:
+    with pytest.raises(ValueError, match=f"^workers must be 1 to the 3 robots, not {workers}$"):
+        TaskVecEnv(make_counter, 3, workers, seed=0, spaces=SPACES)
+
+
+def test_worker_seeds() -> None:
+    seeds = [worker_seed(seed, worker) for seed in range(20) for worker in range(4)]
+    assert len(set(seeds)) == 80
+    assert all(0 <= seed < 2**32 for seed in seeds)
+    assert worker_seed(1, 2) == worker_seed(1, 2)
+
+
+def test_workers_that_raise_or_are_killed_are_named_and_close_leaves_none() -> None:
+    env = TaskVecEnv(functools.partial(make_failing, "step"), 4, 2, seed=0, spaces=SPACES)
+    env.reset()
+    actions = np.zeros((4, 2), dtype=np.float32)
+    env.step(actions)
+    actions[2, 0] = 1.0  # the second worker's first robot
+    with pytest.raises(WorkerError) as caught:
+        env.step(actions)
+    message = str(caught.value)
+    assert message.startswith("worker 1 failed:\nTraceback (most recent call last):")
+    assert "ValueError: the ground is gone" in message and "in step" in message
+    victim = env._processes[0]
+    assert victim.pid is not None
+    os.kill(victim.pid, signal.SIGKILL)
+    for _ in range(2):
+        with pytest.raises(WorkerError, match=r"^worker 0 died \(exit code -9\)$"):
+            env.step(actions)
+    with pytest.raises(WorkerError, match=r"^worker 0 died \(exit code -9\)$"):
+        env.state_dicts()
+    processes = env._processes
+    env.close()
+    assert not any(process.is_alive() for process in processes)
+    env.close()  # once more does no harm
+
+
+def test_a_worker_that_cannot_start_takes_the_others_with_it() -> None:
+    before = set(multiprocessing.active_children())
+    with pytest.raises(WorkerError, match=r"(?s)^worker 0 failed:.*no robot to be had"):
+        TaskVecEnv(functools.partial(make_failing, "start"), 2, 2, seed=0, spaces=SPACES)
+    assert set(multiprocessing.active_children()) <= before
