@@ -41,7 +41,9 @@ class RobotConfig:
     nominal_calf: float = -1.5  # rad (Walk These Ways)
     action_scale: float = 0.25  # rad per unit action: alpha in the paper (Walk These Ways)
     hip_scale: float = 0.5  # hips move half as far per unit action (Walk These Ways)
-    action_limit: float = 6.0  # a_max in the paper: 6 * 0.25 = 1.5 rad either side of nominal
+    # a_max in the paper: 4 * 0.25 = 1 rad either side of nominal. Random targets over 1.5 rad drive
+    # feet through the ground at the default physics step, over 1 rad they do not.
+    action_limit: float = 4.0
     base_height: float = 0.30  # m, standing (benchmark)
 
 

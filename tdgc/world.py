@@ -190,8 +190,9 @@ class World:
         self._joints = [found[name] for name in JOINTS]
         self._leg_of_link = {j: i // 3 for i, j in enumerate(self._joints)}
         self._calf_links = {self._joints[3 * leg + 2] for leg in range(4)}
-        # Bullet holds one speed limit a body: the fastest joint's. ``pd_torque`` keeps the others.
-        fastest = max(self.robot.speed_limit)
+        # Bullet holds one speed limit a body, so it gets the slowest joint's: a calf that whips at
+        # the other joints' 30 rad/s moves its foot further a step than the foot's radius.
+        slowest = min(self.robot.speed_limit)
         for link in range(-1, client.getNumJoints(body)):
             client.setCollisionFilterGroupMask(body, link, _ROBOT, _GROUND)
             client.changeDynamics(
@@ -201,7 +202,7 @@ class World:
                 angularDamping=0.0,
                 jointDamping=0.0,
                 lateralFriction=self.physics.friction,
-                maxJointVelocity=fastest,
+                maxJointVelocity=slowest,
             )
         # Bullet's default velocity motors would hold the joints.
         client.setJointMotorControlArray(

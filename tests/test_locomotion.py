@@ -164,7 +164,7 @@ def test_act_clips_and_keeps_histories(loco: Locomotion) -> None:
     loco.act(second)
     assert (loco.actions[0] == -ROBOT.action_limit).all() and (loco.actions[1] == 1.0).all()
     scale = np.tile([0.125, 0.25, 0.25], 4)
-    for age, action in enumerate([-6.0, 1.0, 0.0]):
+    for age, action in enumerate([-4.0, 1.0, 0.0]):
         expected = np.tile(NOMINAL + action * scale, (2, 1))
         np.testing.assert_allclose(loco.targets[age], expected, atol=1e-12)
     assert loco.clock.clock.tolist() == pytest.approx([0.12, 0.12])  # two steps at 3 Hz

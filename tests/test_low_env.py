@@ -61,8 +61,8 @@ def test_the_registered_environment() -> None:
     assert env.unwrapped.config == LowLevelConfig()
     assert env.observation_space.shape == (109,) and env.observation_space.dtype == np.float32
     assert isinstance(env.action_space, gym.spaces.Box)
-    assert env.action_space.low.tolist() == [-6.0] * 12
-    assert env.action_space.high.tolist() == [6.0] * 12
+    assert env.action_space.low.tolist() == [-4.0] * 12
+    assert env.action_space.high.tolist() == [4.0] * 12
     env.close()
 
 

@@ -204,7 +204,7 @@ def test_joint_targets_scale_and_clip() -> None:
     moved = joint_targets(CONFIG, actions) - nominal_pose(CONFIG)
     assert (moved[0] == 0.0).all()
     np.testing.assert_allclose(moved[1], np.tile([0.25, 0.5, 0.5], 4), atol=1e-12)
-    np.testing.assert_allclose(moved[2], np.tile([-0.75, -1.5, -1.5], 4), atol=1e-12)
+    np.testing.assert_allclose(moved[2], np.tile([-0.5, -1.0, -1.0], 4), atol=1e-12)
 
 
 def torque(error: float, speed: float, strength: float = 1.0) -> list[float]:
