@@ -143,7 +143,7 @@ def test_table_of_flags_is_the_scripts(
     with pytest.raises(SystemExit):
         main(["--help"])
     flags = re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, flags=re.MULTILINE)
-    assert [row[0] for row in rows(heading)] == flags
+    assert [row[0] for row in rows(heading) if row[0].startswith("--")] == flags
 
 
 def test_conditions_are_named() -> None:
