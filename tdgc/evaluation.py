@@ -21,7 +21,7 @@ from tdgc.commands import CONTINUOUS, INDEX, default_command, gait_index
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, from_dict
 from tdgc.gaits import GAITS, gait_embedding
 from tdgc.locomotion import Locomotion
-from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE
+from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE, is_fallen
 from tdgc.policies import Policy
 from tdgc.rewards import CONTACT_FORCE
 from tdgc.robot import Array, wrap_angle
@@ -424,8 +424,7 @@ def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
     up = np.ones(m, dtype=bool)
     minutes = 0.0
     for step, loco in enumerate(_walk_on_plane(low, m, _FALL_SECONDS, seed)):
-        state = loco.world.state
-        up &= (state.position[:, 2] > FALL_HEIGHT) & (state.trunk_force <= TRUNK_FORCE)
+        up &= ~is_fallen(loco.world)
         minutes += up.sum() * dt / 60.0
         if step % switch == 0:
             command[:, 12:] = gait_embedding(rng.integers(0, len(GAITS), m))

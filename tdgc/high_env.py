@@ -20,7 +20,7 @@ from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig, from_dict
 from tdgc.curriculum import Curriculum
 from tdgc.gaits import GAITS
 from tdgc.locomotion import SPEED_SCALE, Locomotion
-from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE, TaskEnv
+from tdgc.low_env import GOAL_RADIUS, TILE_CROP, TaskEnv, is_fallen
 from tdgc.policies import Policy
 from tdgc.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.terrain import (
@@ -37,7 +37,6 @@ from tdgc.world import World
 #: Where the shipped policies are.
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 
-_CROP = 2.0  # m off both sides of training tiles: Bullet keeps 600 bytes a sample
 _GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
 _PROBE_RANGE = 0.5  # m, deeper and higher looks the same
 
@@ -180,7 +179,7 @@ class NavigationTask:
         self._hold = round(config.hold_seconds / self.step_seconds)
         self.family = np.arange(m) % len(config.families)
         self.curriculum = Curriculum(m, config.window, config.threshold, config.levels)
-        self.field = TileField((m, 1), crop=_CROP)
+        self.field = TileField((m, 1), crop=TILE_CROP)
         self._drawn_level = np.full(m, -1)
         self.locomotion = self._build_locomotion()
         self._origin = self.field.origin(np.arange(m), 0)
@@ -295,11 +294,8 @@ class NavigationTask:
         return reward, failed, truncated
 
     def _failed(self, world: World) -> NDArray[np.bool_]:
-        state = world.state
-        x, y = state.position[:, 0], state.position[:, 1]
-        low = state.position[:, 2] - world.support_height(x, y) < FALL_HEIGHT
-        outside = ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
-        return np.asarray(low | (state.trunk_force > TRUNK_FORCE) | outside)
+        x, y = world.state.position[:, 0], world.state.position[:, 1]
+        return is_fallen(world) | ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
 
     def _high_step(self, force: Array) -> rewards.HighStep:
         loco = self.locomotion

@@ -58,7 +58,7 @@ _CROSSING_SPEED = (0.3, 1.0)  # m/s
 _HEADING_GAIN = 1.0  # 1/s, yaw rate asked per rad of heading error
 
 # Training tiles are 4 m wide, since Bullet keeps 600 bytes for each sample of a height field.
-_CROP = 2.0  # m at either side
+TILE_CROP = 2.0  # m at either side
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
 
 # Command curriculum: a gait's velocity range grows when it tracks well over an evaluation batch.
@@ -144,7 +144,7 @@ class LowLevelTask:
         """A tile of its own for every robot, of its level and family."""
         if self.config.terrain == "plane":
             return None
-        return TileField((self.num_robots, 1), crop=_CROP)
+        return TileField((self.num_robots, 1), crop=TILE_CROP)
 
     def _draw_tiles(self) -> None:
         """Fresh tiles at the robots' present levels."""
