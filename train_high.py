@@ -14,9 +14,11 @@ import math
 import sys
 from typing import Any
 
+import torch as th
 from sb3_contrib import RecurrentPPO
 
 from tdgc import __version__
+from tdgc.commands import INDEX, CommandDecoder, default_command
 from tdgc.config import HighLevelConfig, HighTrainConfig, to_dict
 from tdgc.high_env import NavigationTask, check_pair, load_low, summarise
 from tdgc.recurrent import FastRecurrentPolicy
@@ -26,6 +28,20 @@ from tdgc.vec import TaskVecEnv
 
 def make_task(config: HighLevelConfig, low: str, robots: int, seed: int) -> NavigationTask:
     return NavigationTask(config, low, robots, seed)
+
+
+def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
+    """Let the untrained policy's mean action be walking straight on in the default gait.
+
+    Its exploration then stumbles on goals from the first episodes; around the middle of the bounds
+    it would stand still in a random gait.
+    """
+    command = default_command()
+    command[INDEX["vx"]] = config.start_speed
+    decoder = CommandDecoder(config.env.commands, config.env.action_limit)
+    with th.no_grad():
+        policy.action_net.bias.copy_(th.from_numpy(decoder.encode(command)))
+        policy.log_std[-1] = math.log(config.ppo.initial_gait_std)
 
 
 def build(config: HighTrainConfig, device: str) -> tuple[RecurrentPPO, TaskVecEnv]:
@@ -62,6 +78,7 @@ def build(config: HighTrainConfig, device: str) -> tuple[RecurrentPPO, TaskVecEn
         seed=config.seed,
         device=device,
     )
+    start_walking(model.policy, config)
     return model, env
 
 

@@ -178,7 +178,8 @@ class NavigationTask:
         self.horizon = round(config.episode_seconds / self.step_seconds)
         self._hold = round(config.hold_seconds / self.step_seconds)
         self.family = np.arange(m) % len(config.families)
-        self.curriculum = Curriculum(m, config.window, config.threshold, config.levels)
+        first = np.arange(m) // len(config.families) % config.first_levels
+        self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, first)
         self.field = TileField((m, 1), crop=TILE_CROP)
         self._drawn_level = np.full(m, -1)
         self.locomotion = self._build_locomotion()

@@ -55,16 +55,22 @@ _CRITIC_MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
 _CROSSING_SHARE = 0.8
 _FACING_SHARE = 0.6
 _CROSSING_SPEED = (0.3, 1.0)  # m/s
+# What a crossing leaves of the ranges at difficulty 1: a foot that must clear a 13 cm step, or a
+# trunk that bends away from a 0.4 rad slope, cannot follow the rest and learns nothing from it.
+_CLEARANCE = 0.10  # m, added to the least swing height
+_BEND = 0.3  # share of the pitch and roll ranges
 _HEADING_GAIN = 1.0  # 1/s, yaw rate asked per rad of heading error
 
 # Training tiles are 4 m wide, since Bullet keeps 600 bytes for each sample of a height field.
 TILE_CROP = 2.0  # m at either side
+#: A training family beside those of ``tdgc.terrain``: no relief, free commands, no levels.
+FLAT = "flat"
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
 
 # Command curriculum: a gait's velocity range grows when it tracks well over an evaluation batch.
 _GROWTH = 0.05
-# Share of the terms' maxima: about 0.26 m/s and 0.36 rad/s of error at the default sigmas.
-_GROW_LIN, _GROW_YAW = 0.5, 0.6
+# Share of the terms' maxima: errors of about 0.26 m/s and 0.32 rad/s at the default sigmas.
+_GROW_LIN, _GROW_YAW = 0.5, 0.5
 # Share of feet in contact as desired: speed comes after gait. At 0.8 bound never left its first
 # ranges, since its rear feet lift late, and then undershot every faster command.
 _GROW_CONTACT = 0.7
@@ -115,11 +121,13 @@ class LowLevelTask:
         m = num_robots
         self.column = np.arange(m) % len(config.families)
         self.level = self.rng.integers(0, min(3, config.levels), m)
-        self._seed = seed
-        self._epoch = 0
+        self._flat = np.array([config.families[c] == FLAT for c in self.column])
+        self._rugged = ~self._flat if config.terrain == "tiles" else np.zeros(m, dtype=bool)
+        self._seed, self._tiles_drawn = seed, 0
+        self._drawn_level = np.full(m, -1)
         self.field = self._build_field()
         if self.field is not None:
-            self._draw_tiles()
+            self._draw_tiles(np.arange(m))
         self.locomotion = self._build_locomotion()
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._began = np.zeros(m, dtype=np.int64)  # elapsed at the start of the episode
@@ -149,13 +157,17 @@ class LowLevelTask:
             return None
         return TileField((self.num_robots, 1), crop=TILE_CROP)
 
-    def _draw_tiles(self) -> None:
-        """Fresh tiles at the robots' present levels."""
+    def _draw_tiles(self, index: NDArray[np.integer]) -> None:
+        """Fresh tiles for the robots ``index`` (n,) at their present levels."""
         assert self.field is not None
-        for i in range(self.num_robots):
+        for i in index:
             family, level = self.config.families[self.column[i]], int(self.level[i])
-            rng = tile_rng(self._seed, family, level, self._epoch * self.num_robots + i)
-            self.field.place(i, 0, make_tile(family, level / MAX_LEVEL, rng))
+            if family == FLAT:
+                continue  # the field is flat where nothing was placed
+            rng = tile_rng(self._seed, family, level, self._tiles_drawn)
+            self._tiles_drawn += 1
+            self.field.place(int(i), 0, make_tile(family, level / MAX_LEVEL, rng))
+        self._drawn_level[index] = self.level[index]
 
     def _build_locomotion(self) -> Locomotion:
         c = self.config
@@ -172,11 +184,18 @@ class LowLevelTask:
             yaw = rng.uniform(-np.pi, np.pi, n)
             self._crossing[index] = False
         else:
+            stale = index[self._drawn_level[index] != self.level[index]]
+            if stale.size:
+                self._draw_tiles(stale)
+                self.locomotion.world.upload_terrain(stale)
             self._origin[index] = self.field.origin(index, np.zeros_like(index))
             start, goal = draw_start_goal(rng, (n,))
+            # Free commands lead anywhere, so those robots of a flat tile start in its middle.
+            start[self._flat[index], :2] = 0.5 * TILE_SIZE
             xy, yaw = start[:, :2] + self._origin[index], start[:, 2]
             self._waypoint[index] = goal + self._origin[index]
-            self._crossing[index] = rng.uniform(size=n) < _CROSSING_SHARE
+            crossing = (rng.uniform(size=n) < _CROSSING_SHARE) & ~self._flat[index]
+            self._crossing[index] = crossing
         self._reached[index] = False
         self.elapsed[index] = self._began[index] = 0
         self._was_contact[index] = False
@@ -198,9 +217,8 @@ class LowLevelTask:
         Bullet's own history is gone afterwards: what follows depends on ``state_dict`` alone.
         """
         self.locomotion.world.close()
-        self._epoch += 1
         if self.field is not None:
-            self._draw_tiles()
+            self._draw_tiles(np.arange(self.num_robots))
         self.locomotion = self._build_locomotion()
         self._gait_scores[:] = 0.0
         self.reset(np.arange(self.num_robots))
@@ -219,7 +237,8 @@ class LowLevelTask:
         self.elapsed += 1
         self._ground = self._measure_ground()
         terms = rewards.low_terms(self._low_step(before), c.rewards)
-        reward = rewards.total(terms, c.rewards, c.physics.control_dt)
+        penalty = np.where(self._rugged, c.rewards.terrain_penalty, 1.0)
+        reward = rewards.total(terms, c.rewards, c.physics.control_dt, penalty)
         terminated = is_fallen(loco.world)
         truncated = (self.elapsed >= self.horizon) | self._left_tile()
         truncated &= ~terminated
@@ -310,7 +329,8 @@ class LowLevelTask:
     def _draw_commands(self, index: NDArray[np.integer]) -> None:
         n, rng, command = len(index), self.rng, self.locomotion.command
         gait = rng.integers(0, len(GAITS), n)
-        values = rng.uniform(self._low, self._high, (n, len(CONTINUOUS)))
+        low, high = self._bounds(index)
+        values = rng.uniform(low, high)
         values[:, :3] *= self.command_share[gait][:, None]
         # A tenth stands: stepping on the spot is asked for at every goal.
         values[rng.uniform(size=n) < 0.1, :3] = 0.0
@@ -318,6 +338,18 @@ class LowLevelTask:
         self._speed[index] = rng.uniform(*_CROSSING_SPEED, n)
         free = rng.uniform(-np.pi, np.pi, n)
         self._facing[index] = np.where(rng.uniform(size=n) < _FACING_SHARE, 0.0, free)
+
+    def _bounds(self, index: NDArray[np.integer]) -> tuple[Array, Array]:
+        """Lower and upper bounds (n, 12) of the commands drawn for the robots ``index``."""
+        d = np.where(self._crossing[index], self.level[index] / MAX_LEVEL, 0.0)
+        low, high = np.tile(self._low, (len(index), 1)), np.tile(self._high, (len(index), 1))
+        swing, height = INDEX["swing_height"], INDEX["body_height"]
+        low[:, swing] = np.minimum(low[:, swing] + _CLEARANCE * d, high[:, swing])
+        low[:, height] *= 1.0 - d
+        bend = [INDEX["pitch"], INDEX["roll"]]
+        low[:, bend] *= (1.0 - (1.0 - _BEND) * d)[:, None]
+        high[:, bend] *= (1.0 - (1.0 - _BEND) * d)[:, None]
+        return low, high
 
     def _refresh(self) -> None:
         """Everything that changes commands between two steps: resampling, crossing, pushes."""
@@ -427,6 +459,8 @@ class LowLevelTask:
         self._grow_commands()
         if self.field is not None:
             for col, family in enumerate(self.config.families):
+                if family == FLAT:
+                    continue
                 mine = self.column == col
                 add(f"level/{family}/count", mine.sum())
                 add(f"level/{family}/level", self.level[mine].sum())
@@ -461,7 +495,7 @@ class LowLevelTask:
         """JSON-ready state from which ``restart`` gives the same future everywhere."""
         return {
             "rng": self.rng.bit_generator.state,
-            "epoch": self._epoch,
+            "tiles_drawn": self._tiles_drawn,
             "level": self.level.tolist(),
             "command_share": self.command_share.tolist(),
         }
@@ -469,7 +503,7 @@ class LowLevelTask:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over a ``state_dict``; call ``restart`` afterwards."""
         self.rng.bit_generator.state = state["rng"]
-        self._epoch = int(state["epoch"])
+        self._tiles_drawn = int(state["tiles_drawn"])
         self.level = np.array(state["level"], dtype=np.int64)
         self.command_share = np.array(state["command_share"], dtype=np.float64)
 

@@ -234,8 +234,8 @@ LOW_TERMS: dict[str, Callable[[LowStep], Array]] = {
         power,
     )
 }
-_SIGMAS = {"sigma_lin", "sigma_yaw"}
-if set(LOW_TERMS) != {f.name for f in dataclasses.fields(LowRewardConfig)} - _SIGMAS:
+_NO_TERMS = {"sigma_lin", "sigma_yaw", "terrain_penalty"}
+if set(LOW_TERMS) != {f.name for f in dataclasses.fields(LowRewardConfig)} - _NO_TERMS:
     raise TypeError("LOW_TERMS and LowRewardConfig name different terms")
 
 
@@ -248,10 +248,13 @@ def low_terms(step: LowStep, weights: LowRewardConfig) -> dict[str, Array]:
     }
 
 
-def total(terms: Mapping[str, Array], weights: LowRewardConfig, dt: float) -> Array:
-    """R = dt (sum of positive terms) exp(sum of negative terms), (M,).
+def total(
+    terms: Mapping[str, Array], weights: LowRewardConfig, dt: float, penalty: Array | float = 1.0
+) -> Array:
+    """R = dt (sum of positive terms) exp(penalty (sum of negative terms)), (M,).
 
-    A term's group follows from the sign of its weight.
+    A term's group follows from the sign of its weight; ``penalty`` (M,) is the share of the
+    negative ones that counts.
     """
     positive: Array | float = 0.0
     negative: Array | float = 0.0
@@ -260,7 +263,7 @@ def total(terms: Mapping[str, Array], weights: LowRewardConfig, dt: float) -> Ar
             positive = positive + value
         else:
             negative = negative + value
-    return np.asarray(dt * positive * np.exp(negative))
+    return np.asarray(dt * positive * np.exp(penalty * negative))
 
 
 # ---------------------------------------------------------------------------- high level

@@ -51,6 +51,24 @@ def test_bounds() -> None:
     assert decoder.high.tolist() == [*(row[4] for row in CHANNELS), 0.5, 0.5, 0.5]
 
 
+@pytest.mark.parametrize("gait", range(4))
+def test_encode_finds_the_action_in_the_middle(gait: int) -> None:
+    decoder = CommandDecoder(action_limit=2.0)
+    command = default_command()
+    command[INDEX["vx"]], command[12:] = 0.5, gait_embedding(gait)
+    action = decoder.encode(command)
+    assert action[0] == pytest.approx(1.0) and action[1] == 0.0
+    assert action[12] == pytest.approx(2.0 * (-0.75, -0.25, 0.25, 0.75)[gait])
+    np.testing.assert_allclose(decoder.decode(action), command, atol=1e-12)
+
+
+def test_encode_refuses_what_no_action_gives() -> None:
+    command = default_command()
+    command[INDEX["vx"]] = 1.2
+    with pytest.raises(ValueError, match=r"^vx 1.2 is outside \[-1.0, 1.0\]$"):
+        CommandDecoder().encode(command)
+
+
 @pytest.mark.parametrize("channel", range(12))
 def test_each_channel_maps_affinely_and_alone(channel: int) -> None:
     """At -1, 0 and 1, while all others stay in the middle."""

@@ -206,6 +206,13 @@ def test_curriculum_moves_levels_and_redraws_tiles():
         task.close()
 
 
+def test_robots_begin_spread_over_the_first_levels():
+    config = HighLevelConfig(families=("stair", "gap"), first_levels=3)
+    task = NavigationTask(config, LOW, 8, seed=0)
+    assert task.curriculum.levels.tolist() == [0, 0, 1, 1, 2, 2, 0, 0]
+    task.close()
+
+
 def test_restart_depends_on_the_state_alone():
     config = HighLevelConfig(families=("rough", "gap"))
     first = NavigationTask(config, LOW, 3, seed=1)

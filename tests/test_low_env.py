@@ -14,10 +14,10 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import tdgc.low_env as low_env
-from tdgc.commands import INDEX, gait_index
+from tdgc.commands import INDEX, default_command, gait_index
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.low_env import CRITIC_LAYOUT, LowLevelEnv, LowLevelTask, is_fallen, summarise
-from tdgc.robot import Array, RobotState, nominal_pose, yaw_quaternion
+from tdgc.robot import FOOT_RADIUS, Array, RobotState, nominal_pose, yaw_quaternion
 from tdgc.terrain import make_tile, tile_rng
 
 NOMINAL = nominal_pose(RobotConfig())
@@ -548,15 +548,93 @@ def test_no_pushes_outside_training_and_none_felt_at_scale_zero() -> None:
 
 
 def test_each_robot_has_a_tile_of_its_family_and_level() -> None:
-    task = LowLevelTask(TILES, 5, seed=7)
+    task = LowLevelTask(TILES, 6, seed=7)
     assert task.field is not None
-    assert task.column.tolist() == [0, 1, 2, 3, 0]
+    assert task.column.tolist() == [0, 1, 2, 3, 4, 0]
     assert (task.level >= 0).all() and (task.level < 3).all()
-    for i, family in enumerate(("rough", "stair", "gap", "tilt", "rough")):
+    for i, family in enumerate(("rough", "stair", "gap", "tilt"), start=1):
         level = int(task.level[i])
-        tile = make_tile(family, level / 10, tile_rng(7, family, level, i))
+        tile = make_tile(family, level / 10, tile_rng(7, family, level, i - 1))
         crop = slice(40, 121)  # 2 m at either side
         assert (task.field.heights[161 * i : 161 * (i + 1)] == tile.heights[:, crop]).all()
+    for i in (0, 5):
+        assert (task.field.heights[161 * i : 161 * (i + 1)] == 0.0).all()
+    task.close()
+
+
+def test_a_new_level_is_a_new_tile() -> None:
+    """At the next reset, in Bullet too: the landing of a stair of level 7 is 8 x 0.10 m high."""
+    task = LowLevelTask(dataclasses.replace(TILES, families=("stair",)), 2, seed=0)
+    task.level[:] = 0
+    task.reset(np.arange(2))
+    task.level[1] = 7
+    task.reset(np.array([0]))
+    assert task.field is not None
+    assert task.field.heights[161:].max() == pytest.approx(8 * 0.03)
+    task.reset(np.array([1]))
+    assert task.field.heights[:161].max() == pytest.approx(8 * 0.03)
+    assert task.field.heights[161:].max() == pytest.approx(8 * 0.10)
+    put(task, 1, (4.0, 4.0))
+    for _ in range(25):
+        task.step(still(task))
+    state = task.locomotion.world.state
+    assert (state.foot_force[1] > 1.0).any()
+    assert state.foot_position[1, :, 2].min() == pytest.approx(0.8 + FOOT_RADIUS, abs=5e-3)
+    task.close()
+
+
+def test_robots_of_flat_tiles_are_free_and_start_in_the_middle() -> None:
+    config = dataclasses.replace(TILES, families=("flat", "tilt"))
+    task = begin(config, 40, training=True)
+    assert task.field is not None
+    assert not task._crossing[0::2].any() and task._crossing[1::2].any()
+    local = task.locomotion.world.state.position[:, :2] - task.field.origin(np.arange(40), 0)
+    np.testing.assert_allclose(local[0::2], 4.0)
+    np.testing.assert_allclose(local[1::2, 0], 0.75)
+    task.step(still(task))
+    assert set(task.take_stats()) >= {"level/tilt/count"}
+    assert "level/flat/count" not in task.take_stats()
+    task.close()
+
+
+def test_penalties_count_half_on_relief() -> None:
+    """The same still step on level 0 of Tilt, which is flat, and on a flat tile."""
+    quiet = RandomisationConfig(scale=0.0)
+    rewarded = {}
+    for family in ("flat", "tilt"):
+        config = dataclasses.replace(TILES, families=(family,), randomisation=quiet)
+        task = LowLevelTask(config, 1, seed=0, training=False)
+        task.level[:] = 0
+        task.reset(np.arange(1))
+        task._crossing[:] = False
+        task.locomotion.command[:] = default_command()
+        put(task, 0, (4.0, 4.0))
+        rewarded[family] = float(task.step(still(task))[0][0])
+        terms = {k[5:]: v for k, v in task.take_stats().items() if k.startswith("term/")}
+        task.close()
+    positive = 0.02 * sum(v for v in terms.values() if v > 0.0)
+    share = math.log(rewarded["tilt"] / positive) / math.log(rewarded["flat"] / positive)
+    assert share == pytest.approx(0.5, rel=1e-6)
+
+
+def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> None:
+    task = begin(dataclasses.replace(TILES, families=("stair",)), 2)
+    names = ("swing_height", "body_height", "pitch", "vx")
+    columns = [INDEX[name] for name in names]
+    for level, bounds in (
+        (0, [(0.03, 0.20), (-0.10, 0.10), (-0.3, 0.3), (-1.0, 1.0)]),
+        (5, [(0.08, 0.20), (-0.05, 0.10), (-0.195, 0.195), (-1.0, 1.0)]),
+        (10, [(0.13, 0.20), (0.0, 0.10), (-0.09, 0.09), (-1.0, 1.0)]),
+    ):
+        task.level[:], task._crossing[:] = level, [True, False]
+        low, high = task._bounds(np.array([0, 1]))
+        np.testing.assert_allclose(low[0, columns], [b[0] for b in bounds], atol=1e-12)
+        np.testing.assert_allclose(high[0, columns], [b[1] for b in bounds], atol=1e-12)
+        np.testing.assert_array_equal([low[1], high[1]], [task._low, task._high])
+    task.level[:], task._crossing[:] = 10, True
+    for _ in range(20):
+        task._draw_commands(np.arange(2))
+        assert (task.locomotion.command[:, INDEX["swing_height"]] >= 0.13).all()
     task.close()
 
 

@@ -305,7 +305,7 @@ def test_torques_speeds_accelerations_and_power() -> None:
 
 def test_table_and_configuration_name_the_same_terms() -> None:
     fields = {f.name for f in dataclasses.fields(LowRewardConfig)}
-    assert set(LOW_TERMS) | {"sigma_lin", "sigma_yaw"} == fields
+    assert set(LOW_TERMS) | {"sigma_lin", "sigma_yaw", "terrain_penalty"} == fields
     assert all(LOW_TERMS[name].__name__ == name for name in LOW_TERMS)
     weights = LowRewardConfig()
     positive = {name for name in LOW_TERMS if getattr(weights, name) > 0.0}
@@ -337,6 +337,12 @@ def test_total_multiplies_what_tracking_earns() -> None:
     np.testing.assert_allclose(total(terms, weights, 0.02), expected, atol=1e-15)
 
 
+def test_a_share_of_the_penalties() -> None:
+    terms = {"track_lin_vel": np.array([1.0, 1.0]), "foot_slip": np.array([-0.6, -0.6])}
+    shares = total(terms, LowRewardConfig(), 0.02, np.array([1.0, 0.5]))
+    np.testing.assert_allclose(shares, [0.02 * E(-0.6), 0.02 * E(-0.3)], atol=1e-15)
+
+
 def test_total_groups_by_the_sign_of_the_weight() -> None:
     """A term belongs to the group of its weight, though its own value be of the other sign."""
     terms = {"track_lin_vel": np.array([1.0]), "body_height": np.array([0.5])}
@@ -352,7 +358,7 @@ def test_a_perfect_step_earns_the_most_there_is() -> None:
     step.state.derive()
     weights = LowRewardConfig(raibert_foothold=0.0)
     best = total(low_terms(step, weights), weights, 0.02)
-    np.testing.assert_allclose(best, [0.03, 0.03], atol=1e-12)
+    np.testing.assert_allclose(best, [0.045, 0.045], atol=1e-12)
 
 
 def test_desired_contact_of_a_trot_weighs_the_diagonal_in_swing() -> None:
