@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +19,16 @@ from tdgc.config import LowLevelConfig
 from tdgc.gaits import GAITS, gait_embedding, swing_profile
 from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
 from tdgc.robot import HIPS_XY, NUM_JOINTS, Array, wrap_angle
-from tdgc.terrain import MAX_LEVEL, TILE_SIZE, TileField, draw_start_goal, make_tile, tile_rng
+from tdgc.terrain import (
+    MAX_LEVEL,
+    TILE_SIZE,
+    TRENCH_DEPTH,
+    Tile,
+    TileField,
+    draw_start_goal,
+    make_tile,
+    tile_rng,
+)
 from tdgc.world import World
 
 FALL_HEIGHT = 0.15  # m, trunk above the support surface (paper Sec. IV-C)
@@ -53,7 +63,7 @@ _CRITIC_MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
 # Terrain episodes: most robots cross the tile from platform to platform, as the decision level
 # will ask of them, facing where they go or any other way; the rest take free commands.
 _CROSSING_SHARE = 0.8
-_FACING_SHARE = 0.6
+_FACING_SHARE = 0.8
 _CROSSING_SPEED = (0.3, 1.0)  # m/s
 # What a crossing leaves of the ranges at difficulty 1: a foot that must clear a 13 cm step, or a
 # trunk that bends away from a 0.4 rad slope, cannot follow the rest and learns nothing from it.
@@ -66,6 +76,11 @@ TILE_CROP = 2.0  # m at either side
 #: A training family beside those of ``tdgc.terrain``: no relief, free commands, no levels.
 FLAT = "flat"
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
+
+# Of the commands drawn, in the order of GAITS. Free: pace and bound take longest to learn.
+# Crossing: trot climbs best, and with all gaits alike the worst one decides how far levels rise.
+_FREE_GAITS = (0.2, 0.2, 0.25, 0.35)
+_CROSSING_GAITS = (0.5, 0.1, 0.15, 0.25)
 
 # Command curriculum: a gait's velocity range grows when it tracks well over an evaluation batch.
 _GROWTH = 0.05
@@ -82,6 +97,16 @@ def is_fallen(world: World) -> NDArray[np.bool_]:
     support = world.support_height(state.position[:, 0], state.position[:, 1])
     low = state.position[:, 2] - support < FALL_HEIGHT
     return np.asarray(low | (state.trunk_force > TRUNK_FORCE))
+
+
+def shallow(tile: Tile, level: int) -> Tile:
+    """The tile with its trenches no deeper than the level's share of their depth.
+
+    At full depth the narrowest trench catches a leg for good, and a robot that falls over the first
+    one whatever it does learns nothing. Only this training is softened, never an evaluation.
+    """
+    depth = TRENCH_DEPTH * min(1.0, (level + 1) / (MAX_LEVEL + 1))
+    return dataclasses.replace(tile, heights=np.maximum(tile.heights, tile.support - depth))
 
 
 class LowLevelTask:
@@ -166,7 +191,7 @@ class LowLevelTask:
                 continue  # the field is flat where nothing was placed
             rng = tile_rng(self._seed, family, level, self._tiles_drawn)
             self._tiles_drawn += 1
-            self.field.place(int(i), 0, make_tile(family, level / MAX_LEVEL, rng))
+            self.field.place(int(i), 0, shallow(make_tile(family, level / MAX_LEVEL, rng), level))
         self._drawn_level[index] = self.level[index]
 
     def _build_locomotion(self) -> Locomotion:
@@ -279,8 +304,12 @@ class LowLevelTask:
         )
 
     def _measure_ground(self) -> tuple[Array, Array, Array]:
-        """Trunk above the ground (M,), feet above the ground (M, 4), probes below the standing
-        trunk (M, 15), in m."""
+        """Trunk (M,) and feet (M, 4) above the support surface, probes of the ground below the
+        standing trunk (M, 15), in m.
+
+        The support surface has its trenches filled: a foot on its way over one is not half a metre
+        too high.
+        """
         world = self.locomotion.world
         state = world.state
         c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
@@ -288,15 +317,15 @@ class LowLevelTask:
         x = state.position[:, :1] + c * points[:, 0] - s * points[:, 1]
         y = state.position[:, 1:2] + s * points[:, 0] + c * points[:, 1]
         n = len(_PROBES)
-        surface = world.ground_height(
-            np.concatenate([x[:, :n], state.foot_position[..., 0]], axis=1),
-            np.concatenate([y[:, :n], state.foot_position[..., 1]], axis=1),
+        probes = world.ground_height(x[:, :n], y[:, :n])
+        support = world.support_height(
+            np.concatenate([x[:, n:], state.foot_position[..., 0]], axis=1),
+            np.concatenate([y[:, n:], state.foot_position[..., 1]], axis=1),
         )
-        support = world.support_height(x[:, n:], y[:, n:]).mean(axis=1)
-        base = state.position[:, 2] - support
-        feet = state.foot_position[..., 2] - surface[:, n:]
+        base = state.position[:, 2] - support[:, :4].mean(axis=1)
+        feet = state.foot_position[..., 2] - support[:, 4:]
         standing = state.position[:, 2:3] - self.config.robot.base_height
-        return base, feet, surface[:, :n] - standing
+        return base, feet, probes - standing
 
     def _low_step(self, speed_before: Array) -> rewards.LowStep:
         loco, c = self.locomotion, self.config
@@ -328,7 +357,8 @@ class LowLevelTask:
 
     def _draw_commands(self, index: NDArray[np.integer]) -> None:
         n, rng, command = len(index), self.rng, self.locomotion.command
-        gait = rng.integers(0, len(GAITS), n)
+        shares = np.where(self._crossing[index, None], _CROSSING_GAITS, _FREE_GAITS)
+        gait = np.sum(rng.uniform(size=(n, 1)) > np.cumsum(shares, axis=1)[:, :-1], axis=1)
         low, high = self._bounds(index)
         values = rng.uniform(low, high)
         values[:, :3] *= self.command_share[gait][:, None]

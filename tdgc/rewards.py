@@ -36,7 +36,7 @@ class LowStep:
         phases: (M, 4) warped foot phases; contact: (M, 4) desired contact C; swing: (M, 4)
             triangle of the swing.
         base_height: (M,) m, trunk above the ground under it.
-        foot_height: (M, 4) m, foot centre above the ground under it.
+        foot_height: (M, 4) m, foot centre above the support surface under it.
         standing_height: m, to which the body height command is added.
         targets: (3, M, 12) rad, joint targets of this step and the two before.
         actions: (2, M, 12), this action and the one before.

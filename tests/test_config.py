@@ -7,8 +7,10 @@ from typing import Any
 import pytest
 
 from tdgc.config import (
+    PRESETS,
     CommandRanges,
     ConfigError,
+    HighTrainConfig,
     LowLevelConfig,
     LowTrainConfig,
     PhysicsConfig,
@@ -158,3 +160,13 @@ def test_wrong_overrides(assignment: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         with_overrides(LowTrainConfig(), [assignment])
     assert "\n" not in str(caught.value)
+
+
+def test_the_papers_preset_is_its_table() -> None:
+    config = with_overrides(HighTrainConfig(), PRESETS["paper"])
+    assert (config.seed, config.n_envs, config.env.decimation) == (42, 100, 1)
+    ppo = config.ppo
+    assert (ppo.learning_rate, ppo.ent_coef, ppo.clip_range) == (1e-4, 1e-4, 0.2)
+    assert (ppo.gamma, ppo.gae_lambda) == (0.99, 0.95)
+    assert (ppo.n_steps, ppo.n_epochs, ppo.minibatches) == (24, 5, 4)
+    assert with_overrides(HighTrainConfig(), PRESETS["default"]) == HighTrainConfig()

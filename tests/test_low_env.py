@@ -16,7 +16,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 import tdgc.low_env as low_env
 from tdgc.commands import INDEX, default_command, gait_index
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
-from tdgc.low_env import CRITIC_LAYOUT, LowLevelEnv, LowLevelTask, is_fallen, summarise
+from tdgc.low_env import CRITIC_LAYOUT, LowLevelEnv, LowLevelTask, is_fallen, shallow, summarise
 from tdgc.robot import FOOT_RADIUS, Array, RobotState, nominal_pose, yaw_quaternion
 from tdgc.terrain import make_tile, tile_rng
 
@@ -554,7 +554,7 @@ def test_each_robot_has_a_tile_of_its_family_and_level() -> None:
     assert (task.level >= 0).all() and (task.level < 3).all()
     for i, family in enumerate(("rough", "stair", "gap", "tilt"), start=1):
         level = int(task.level[i])
-        tile = make_tile(family, level / 10, tile_rng(7, family, level, i - 1))
+        tile = shallow(make_tile(family, level / 10, tile_rng(7, family, level, i - 1)), level)
         crop = slice(40, 121)  # 2 m at either side
         assert (task.field.heights[161 * i : 161 * (i + 1)] == tile.heights[:, crop]).all()
     for i in (0, 5):
@@ -636,6 +636,15 @@ def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> 
         task._draw_commands(np.arange(2))
         assert (task.locomotion.command[:, INDEX["swing_height"]] >= 0.13).all()
     task.close()
+
+
+def test_trenches_are_shallow_on_easy_levels_of_training() -> None:
+    rng = np.random.default_rng(0)
+    for level, depth in ((0, 0.6 / 11), (4, 0.6 * 5 / 11), (10, 0.6)):
+        tile = shallow(make_tile("gap", level / 10, rng), level)
+        assert tile.heights.min() == pytest.approx(-depth)
+    tilt = make_tile("tilt", 1.0, rng)
+    assert (shallow(tilt, 0).heights == tilt.heights).all()
 
 
 def ended(
