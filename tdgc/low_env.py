@@ -115,7 +115,7 @@ class LowLevelTask:
     Observation rows are [actor part | critic part]; ``actor_dim`` says where the actor's ends.
     Actions are (M, 12) in [-a_max, a_max]. An episode ends in failure when the trunk is lower than
     0.15 m above the support surface or hits something with more than 40 N, and is truncated after
-    20 s or where the robot leaves its tile.
+    20 s, where the robot leaves its tile, or when it has crossed it.
 
     Args:
         config: the MDP's configuration.
@@ -265,7 +265,7 @@ class LowLevelTask:
         penalty = np.where(self._rugged, c.rewards.terrain_penalty, 1.0)
         reward = rewards.total(terms, c.rewards, c.physics.control_dt, penalty)
         terminated = is_fallen(loco.world)
-        truncated = (self.elapsed >= self.horizon) | self._left_tile()
+        truncated = (self.elapsed >= self.horizon) | self._left_tile() | self._reached
         truncated &= ~terminated
         self._count(terms, reward, terminated)
         self._was_contact = loco.world.state.foot_force > rewards.CONTACT_FORCE
@@ -396,14 +396,7 @@ class LowLevelTask:
         """Point the velocity commands of crossing robots at their waypoint."""
         state = self.locomotion.world.state
         offset = self._waypoint - state.position[:, :2]
-        arrived = self._crossing & (np.linalg.norm(offset, axis=1) < GOAL_RADIUS)
-        if arrived.any():
-            # There and back again: the next waypoint is on the platform at the other end.
-            self._reached |= arrived
-            local = self._waypoint[arrived] - self._origin[arrived]
-            local[:, 0] = TILE_SIZE - local[:, 0]
-            self._waypoint[arrived] = local + self._origin[arrived]
-            offset = self._waypoint - state.position[:, :2]
+        self._reached |= self._crossing & (np.linalg.norm(offset, axis=1) < GOAL_RADIUS)
         bearing = np.arctan2(offset[:, 1], offset[:, 0])
         error = wrap_angle(bearing + self._facing - state.yaw)
         direction = bearing - state.yaw

@@ -469,8 +469,8 @@ def test_crossing_velocities_keep_their_direction_within_the_ranges() -> None:
     task.close()
 
 
-def test_a_robot_that_arrives_is_sent_back() -> None:
-    task = begin(TILES)
+def test_an_episode_ends_with_the_crossing() -> None:
+    task = begin(dataclasses.replace(TILES, families=("tilt",)))
     assert task.field is not None
     task._crossing[:] = True
     origin = task.field.origin(0, 0)
@@ -478,11 +478,14 @@ def test_a_robot_that_arrives_is_sent_back() -> None:
     put(task, 0, (6.7, 4.4))
     task._steer_crossings()
     assert not task._reached[0]
+    assert not task.step(still(task))[2][0]
     put(task, 0, (6.8, 4.4))
     task._steer_crossings()
-    assert task._reached[0]
-    np.testing.assert_allclose(task._waypoint[0], origin + [0.75, 4.4], atol=1e-9)
-    assert task.locomotion.command[0, 0] < 0.0
+    assert task.reached[0]
+    _, terminated, truncated = task.step(still(task))
+    assert truncated[0] and not terminated[0]
+    task.reset(np.arange(1))
+    assert not task.reached[0]
     task.close()
 
 
@@ -678,7 +681,7 @@ def test_promotion() -> None:
     assert ended(2.0, reached=True) == 6
     assert ended(2.0, reached=True, falls=True, elapsed=600) == 6
     assert ended(2.0, reached=True, crossing=False) == 5
-    assert ended(2.0, reached=True, elapsed=500) == 5  # the episode goes on
+    assert ended(2.0, reached=True, elapsed=500) == 6
     assert ended(2.0, reached=True, training=False) == 5
 
 
