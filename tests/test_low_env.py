@@ -625,9 +625,9 @@ def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> 
     names = ("swing_height", "body_height", "pitch", "vx")
     columns = [INDEX[name] for name in names]
     for level, bounds in (
-        (0, [(0.03, 0.20), (-0.10, 0.10), (-0.3, 0.3), (-1.0, 1.0)]),
-        (5, [(0.08, 0.20), (-0.05, 0.10), (-0.195, 0.195), (-1.0, 1.0)]),
-        (10, [(0.13, 0.20), (0.0, 0.10), (-0.09, 0.09), (-1.0, 1.0)]),
+        (0, [(0.08, 0.20), (-0.10, 0.10), (-0.3, 0.3), (-1.0, 1.0)]),
+        (5, [(0.12, 0.20), (-0.05, 0.10), (-0.195, 0.195), (-1.0, 1.0)]),
+        (10, [(0.16, 0.20), (0.0, 0.10), (-0.09, 0.09), (-1.0, 1.0)]),
     ):
         task.level[:], task._crossing[:] = level, [True, False]
         low, high = task._bounds(np.array([0, 1]))
@@ -637,7 +637,7 @@ def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> 
     task.level[:], task._crossing[:] = 10, True
     for _ in range(20):
         task._draw_commands(np.arange(2))
-        assert (task.locomotion.command[:, INDEX["swing_height"]] >= 0.13).all()
+        assert (task.locomotion.command[:, INDEX["swing_height"]] >= 0.16).all()
     task.close()
 
 
