@@ -643,7 +643,7 @@ def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> 
 
 def test_trenches_are_shallow_on_easy_levels_of_training() -> None:
     rng = np.random.default_rng(0)
-    for level, depth in ((0, 0.6 / 11), (4, 0.6 * 5 / 11), (10, 0.6)):
+    for level, depth in ((0, 0.05), (4, 0.138), (10, 0.6)):
         tile = shallow(make_tile("gap", level / 10, rng), level)
         assert tile.heights.min() == pytest.approx(-depth)
     tilt = make_tile("tilt", 1.0, rng)
