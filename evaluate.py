@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Evaluate the shipped policies on TDGC-Bench: a table, episodes.csv, summary.json and figures.
+"""Evaluate policies on TDGC-Bench: a table, episodes.csv, summary.json and figures.
 
 python evaluate.py --levels 6-10
 python evaluate.py --tracking
@@ -9,34 +9,35 @@ python evaluate.py --policies gp --families stair,gap --levels 8 --episodes 20 -
 from __future__ import annotations
 
 import argparse
-import csv
 import functools
 import json
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from tdgc import plots
+from tdgc.config import LowLevelConfig
+from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
 from tdgc.evaluation import (
     CONDITIONS,
     Cell,
     Episode,
-    GaitPolicyDriver,
-    low_config,
     plan,
     run_cell,
-    run_cells,
-    summarise,
+    spread,
     tracking,
+    write_results,
 )
-from tdgc.high_env import PRETRAINED
-from tdgc.policies import Policy, load
+from tdgc.high_env import PRETRAINED, load_low
+from tdgc.policies import Policy
 from tdgc.terrain import ALL_FAMILIES, FAMILIES, OOD_LEVELS
 
-POLICIES = ("gp",)
+POLICIES = ("tdgc", "gp")
+SHIPPED_HIGH = PRETRAINED / "high"
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -44,11 +45,16 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
     parser.add_argument("--families", default="all", help=f"all, or of {', '.join(ALL_FAMILIES)}")
     parser.add_argument("--episodes", type=int, default=100, help="a cell (100)")
-    parser.add_argument("--policies", default=",".join(POLICIES), help=", ".join(POLICIES))
+    parser.add_argument(
+        "--policies",
+        help="all, or of tdgc (the hierarchy), gp (the scripted baseline); all where there is a "
+        "high level, shipped or given by --high, and otherwise gp",
+    )
     parser.add_argument(
         "--conditions", default="nominal", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
     )
     parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low-level policy")
+    parser.add_argument("--high", type=Path, help="high-level policy (the shipped one)")
     parser.add_argument("--tracking", action="store_true", help="the low level alone, on the plane")
     parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
@@ -64,6 +70,8 @@ def choose(
     for name in names:
         if name not in allowed:
             raise ValueError(f"unknown {what} '{name}'; allowed: all, {', '.join(allowed)}")
+        if names.count(name) > 1:
+            raise ValueError(f"{what} '{name}' is named twice")
     return names
 
 
@@ -71,7 +79,7 @@ def choose_levels(text: str) -> list[int]:
     """``6-10`` or ``0,5,10`` as a list of levels.
 
     Raises:
-        ValueError: not numbers, or outside 0-12.
+        ValueError: not numbers, outside 0-12, or one of them twice.
     """
     levels: list[int] = []
     for part in text.split(","):
@@ -83,11 +91,32 @@ def choose_levels(text: str) -> list[int]:
     top = OOD_LEVELS[-1]
     if not levels or min(levels) < 0 or max(levels) > top:
         raise ValueError(f"--levels '{text}' must name levels from 0 to {top}")
+    if len(set(levels)) < len(levels):
+        raise ValueError(f"--levels '{text}' names a level twice")
     return levels
 
 
-def run_one(cell: Cell, low: Policy, seed: int) -> list[Episode]:
-    return run_cell(cell, low, GaitPolicyDriver(), seed)
+def make_drivers(
+    names: list[str], high: Path | None, low: Policy, config: LowLevelConfig
+) -> dict[str, Driver]:
+    """What drives the robots of each policy asked for.
+
+    Raises:
+        ValueError: no high level, or one that does not fit the low level.
+    """
+    drivers: dict[str, Driver] = {}
+    for name in names:
+        if name == "gp":
+            drivers[name] = BaselineDriver()
+        elif high is None:
+            raise ValueError("no high level is shipped; give one with --high, or use --policies gp")
+        else:
+            drivers[name] = HierarchyDriver(*load_high(high, low, config))
+    return drivers
+
+
+def run_one(cell: Cell, low: Policy, drivers: Mapping[str, Driver], seed: int) -> list[Episode]:
+    return run_cell(cell, low, drivers[cell.policy], seed)
 
 
 def print_table(summary: dict[str, Any]) -> None:
@@ -108,7 +137,6 @@ def print_table(summary: dict[str, Any]) -> None:
 
 def run_tracking(low: Policy, args: argparse.Namespace) -> None:
     result = tracking(low, args.episodes, args.seed, args.workers)
-    args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "tracking.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
     print("gait    velocity RMSE  yaw rate RMSE  contact match")
     for gait, r in result["gaits"].items():
@@ -119,44 +147,49 @@ def run_tracking(low: Policy, args: argparse.Namespace) -> None:
     print(f"{result['falls_per_10_min']:.2f} falls in 10 minutes ({result['minutes']:.1f} walked)")
 
 
-def run_table(low: Policy, args: argparse.Namespace, cells: list[Cell]) -> None:
-    work = functools.partial(run_one, low=low, seed=args.seed)
-    args.out.mkdir(parents=True, exist_ok=True)
+def run_table(
+    low: Policy, drivers: Mapping[str, Driver], cells: list[Cell], args: argparse.Namespace
+) -> None:
+    work = functools.partial(run_one, low=low, drivers=drivers, seed=args.seed)
     episodes: list[Episode] = []
     with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
-        for rows in run_cells(cells, work, args.workers):
+        for rows in spread(work, cells, args.workers):
             episodes += rows
             bar.update(len(rows))
-    with open(args.out / "episodes.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(episodes[0].row()))
-        writer.writeheader()
-        writer.writerows(e.row() for e in episodes)
-    summary = summarise(episodes)
-    (args.out / "summary.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
+    summary = write_results(args.out, episodes)
     plots.success_by_level(args.out / "summary.json", args.out / "success.png")
+    plots.gait_shares(args.out, args.out / "gaits.png")
+    plots.headings(args.out, args.out / "headings.png")
+    plots.trajectories(args.out, args.out / "trajectories.png")
     print_table(summary)
-    print(f"\nepisodes.csv, summary.json and success.png are in {args.out}")
+    print(f"\ntables and figures are in {args.out}")
 
 
 def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
+    shipped = SHIPPED_HIGH.with_suffix(".json").is_file()
+    high = args.high or (SHIPPED_HIGH if shipped else None)
     try:
         levels = choose_levels(args.levels)
         families = choose(args.families, ALL_FAMILIES, FAMILIES, "family")
-        names = choose(args.policies, POLICIES, POLICIES, "policy")
+        default = "gp" if high is None else "all"
+        names = choose(args.policies or default, POLICIES, POLICIES, "policy")
         conditions = choose(args.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition")
         for flag, value in (("--episodes", args.episodes), ("--workers", args.workers)):
             if value < 1:
                 raise ValueError(f"{flag} must be at least 1, not {value}")
-        low = load(args.low)
-        low_config(low)
-    except ValueError as error:
+        if not 0 <= args.seed < 2**32:
+            raise ValueError(f"--seed must lie in [0, 2**32), not {args.seed}")
+        low, config = load_low(args.low)
+        drivers = {} if args.tracking else make_drivers(names, high, low, config)
+        args.out.mkdir(parents=True, exist_ok=True)
+    except (ValueError, OSError) as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
     if args.tracking:
         run_tracking(low, args)
     else:
-        run_table(low, args, plan(names, conditions, families, levels, args.episodes))
+        run_table(low, drivers, plan(names, conditions, families, levels, args.episodes), args)
     return 0
 
 

@@ -15,15 +15,14 @@ import sys
 from typing import Any
 
 import torch as th
-from sb3_contrib import RecurrentPPO
 
 from tdgc import __version__
 from tdgc.commands import INDEX, CommandDecoder, default_command
-from tdgc.config import HighLevelConfig, HighTrainConfig, to_dict
+from tdgc.config import PRESETS, HighLevelConfig, HighTrainConfig, to_dict
 from tdgc.high_env import NavigationTask, check_pair, load_low, summarise
-from tdgc.recurrent import FastRecurrentPolicy
+from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.training import Phase, add_arguments, configure, run
-from tdgc.vec import TaskVecEnv
+from tdgc.vec import TaskVecEnv, WorkerError
 
 
 def make_task(config: HighLevelConfig, low: str, robots: int, seed: int) -> NavigationTask:
@@ -44,7 +43,9 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
         policy.log_std[-1] = math.log(config.ppo.initial_gait_std)
 
 
-def build(config: HighTrainConfig, device: str) -> tuple[RecurrentPPO, TaskVecEnv]:
+def build(
+    config: HighTrainConfig, device: str, timeout: float
+) -> tuple[FastRecurrentPPO, TaskVecEnv]:
     """Workers and learner."""
     probe = NavigationTask(config.env, config.low, 1, seed=0)
     spaces = probe.observation_space, probe.action_space
@@ -55,9 +56,11 @@ def build(config: HighTrainConfig, device: str) -> tuple[RecurrentPPO, TaskVecEn
         config.workers,
         config.seed,
         spaces,
+        recover=True,
+        timeout=timeout,
     )
     ppo = config.ppo
-    model = RecurrentPPO(
+    model = FastRecurrentPPO(
         FastRecurrentPolicy,
         env,
         learning_rate=ppo.learning_rate,
@@ -86,7 +89,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     add_arguments(parser, "runs/high")
     parser.add_argument("--low", help="low-level policy (the shipped one)")
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="default", help="paper: the paper's hyperparameters"
+    )
     args = parser.parse_args(arguments)
+    args.assignments[:0] = PRESETS[args.preset]
     if args.low is not None:
         args.assignments.append(f"low={args.low}")
     try:
@@ -104,6 +111,9 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         print(f"train_high.py: {error}", file=sys.stderr)
         return 2
+    except (WorkerError, OSError) as error:
+        print(f"train_high.py: {error}", file=sys.stderr)
+        return 1
     return 0
 
 

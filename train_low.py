@@ -21,7 +21,7 @@ from tdgc.config import LowLevelConfig, LowTrainConfig, to_dict
 from tdgc.low_env import LowLevelTask, summarise
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.training import Phase, add_arguments, configure, run
-from tdgc.vec import TaskVecEnv
+from tdgc.vec import TaskVecEnv, WorkerError
 
 
 def make_task(config: LowLevelConfig, robots: int, seed: int) -> LowLevelTask:
@@ -43,7 +43,7 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
 
 
 def build(
-    config: LowTrainConfig, env_config: LowLevelConfig, device: str
+    config: LowTrainConfig, env_config: LowLevelConfig, device: str, timeout: float
 ) -> tuple[PPO, TaskVecEnv]:
     """Workers and learner of one phase."""
     probe = LowLevelTask(dataclasses.replace(env_config, terrain="plane"), 1, seed=0)
@@ -53,6 +53,8 @@ def build(
         config.workers,
         config.seed,
         (probe.observation_space, probe.action_space),
+        recover=True,
+        timeout=timeout,
     )
     ppo = config.ppo
     first, last = ppo.learning_rate, ppo.final_learning_rate
@@ -105,6 +107,9 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         print(f"train_low.py: {error}", file=sys.stderr)
         return 2
+    except (WorkerError, OSError) as error:
+        print(f"train_low.py: {error}", file=sys.stderr)
+        return 1
     log = args.out / "log.jsonl"
     if log.exists():
         plots.training_curve(log, args.out / "training.png")

@@ -285,7 +285,7 @@ class HighTrainConfig:
     workers: int = 2
     steps: int = 10_000_000  # decisions altogether
     log_steps: int = 24_000
-    checkpoint_steps: int = 240_000  # whole episodes of every robot, ten or so
+    checkpoint_steps: int = 60_000  # three whole episodes of every robot; each begins them anew
     start_speed: float = 0.5  # m/s: before any training it walks straight on in the default gait
     low: str = "tdgc/pretrained/low"
     env: HighLevelConfig = field(default_factory=HighLevelConfig)

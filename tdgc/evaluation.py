@@ -1,36 +1,42 @@
 """Evaluation (TDGC-Bench): episodes on fixed tiles -> rows -> rates with Wilson intervals.
 
-An episode is a function of its policy, condition and tile alone. Episodes run in batches, each in
-a world of its own that holds one tile a robot; the batches do not depend on how many processes
-share them, so neither does the table.
+Episodes run in batches, each in a world of its own that holds one tile a robot. A batch depends on
+its policy, condition and tiles alone, not on how many processes share the batches, so neither does
+the table.
 """
 
 from __future__ import annotations
 
+import csv
+import ctypes
 import dataclasses
 import functools
+import json
 import multiprocessing as mp
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.commands import CONTINUOUS, INDEX, default_command, gait_index
+from tdgc.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, from_dict
+from tdgc.drivers import Driver
 from tdgc.gaits import GAITS, gait_embedding
 from tdgc.locomotion import Locomotion
 from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE, is_fallen
 from tdgc.policies import Policy
 from tdgc.rewards import CONTACT_FORCE
-from tdgc.robot import Array, wrap_angle
-from tdgc.terrain import EVAL_STREAM, FAMILIES, MAX_LEVEL, TileField, make_tile, tile_rng
+from tdgc.robot import NUM_JOINTS, Array
+from tdgc.terrain import ALL_FAMILIES, EVAL_STREAM, MAX_LEVEL, Tile, TileField, make_tile, tile_rng
 from tdgc.vec import one_blas_thread
 
 HORIZON = 20.0  # s (benchmark)
 OUTCOMES = ("reached", "fell", "collided", "left_tile", "timeout")
-BATCH = 20  # episodes a world: enough to keep numpy busy, few enough to share out evenly
+BATCH = 50  # episodes a world: enough to keep numpy busy, few enough to share out evenly
+POSE_SECONDS = 0.2  # between two poses of a track: 20 cm of walking at most
 
 
 @dataclass(frozen=True)
@@ -80,9 +86,16 @@ class Cell:
     count: int
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Episode:
-    """A row of episodes.csv."""
+    """A row of episodes.csv, and where the robot went.
+
+    Attributes:
+        shares: of its time in each gait of ``GAITS``, as commanded.
+        goal: (2,) m, in the tile's frame.
+        track: (n, 3) x, y in m in the tile's frame and heading in rad, every ``POSE_SECONDS`` from
+            the start and once more at the end.
+    """
 
     policy: str
     condition: str
@@ -93,66 +106,17 @@ class Episode:
     outcome: str
     time_s: float
     path_m: float
-    shares: tuple[float, ...] = field(default=(0.0,) * len(GAITS))
+    shares: tuple[float, ...]
+    goal: Array
+    track: Array
 
     def row(self) -> dict[str, Any]:
-        """Flat dict with one column a gait share."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)[:-1]}
-        values["time_s"], values["path_m"] = round(self.time_s, 2), round(self.path_m, 3)
-        return values | {
-            f"share_{gait}": round(share, 4) for gait, share in zip(GAITS, self.shares, strict=True)
-        }
-
-
-class Driver(Protocol):
-    """What decides on commands in an evaluation: ``gp``, or the high level."""
-
-    def begin(self, loco: Locomotion, goal: Array) -> None:
-        """New episodes for all robots of ``loco``; ``goal`` (M, 2) m in the world."""
-
-    def command(self, step: int) -> Array:
-        """Commands (M, 15) for the coming control step number ``step``."""
-
-
-@dataclass(frozen=True)
-class GoToGoal:
-    """``gp``, the paper's baseline: a scripted law over the same frozen low level.
-
-    Walks in trot with default behaviour parameters, as fast as the distance asks, turning by the
-    heading error, and slows while it faces away. No terrain cues. Gains tuned on training tiles
-    (docs/experiments.md).
-    """
-
-    top_speed: float = 0.8  # m/s
-    distance_gain: float = 1.0  # 1/s
-    heading_gain: float = 1.5  # 1/s
-    swing_height: float = 0.08  # m
-
-    def law(self, position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
-        """Forward speed and yaw rate: positions (M, 2), headings (M,), goals (M, 2)."""
-        offset = goal - position
-        error = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - yaw)
-        speed = np.minimum(self.top_speed, self.distance_gain * np.linalg.norm(offset, axis=1))
-        turn = np.clip(self.heading_gain * error, *CommandRanges().yaw_rate)
-        return speed * np.maximum(np.cos(error), 0.0), turn
-
-
-class GaitPolicyDriver:
-    """Drives robots by ``GoToGoal``."""
-
-    def __init__(self, law: GoToGoal | None = None) -> None:
-        self.law = law or GoToGoal()
-
-    def begin(self, loco: Locomotion, goal: Array) -> None:
-        self._loco, self._goal = loco, goal
-        self._command = np.tile(default_command(), (loco.num_robots, 1))
-        self._command[:, INDEX["swing_height"]] = self.law.swing_height
-
-    def command(self, step: int) -> Array:
-        state = self._loco.world.state
-        speed, turn = self.law.law(state.position[:, :2], state.yaw, self._goal)
-        self._command[:, INDEX["vx"]], self._command[:, INDEX["yaw_rate"]] = speed, turn
-        return self._command
+        """The row, with one column a gait share."""
+        beside = ("shares", "goal", "track")
+        names = [f.name for f in dataclasses.fields(self) if f.name not in beside]
+        row = {name: getattr(self, name) for name in names}
+        row["time_s"], row["path_m"] = round(self.time_s, 2), round(self.path_m, 3)
+        return row | {f"share_{g}": round(x, 4) for g, x in zip(GAITS, self.shares, strict=True)}
 
 
 def low_config(low: Policy) -> LowLevelConfig:
@@ -177,15 +141,19 @@ def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
 
 def push_velocities(cell: Cell, seed: int, speed: float, pushes: int) -> Array:
     """Push k of each episode, (count, pushes, 3) m/s: the same for every policy."""
+    family = ALL_FAMILIES.index(cell.family)
     result = np.zeros((cell.count, pushes, 3))
     for k in range(cell.count):
-        entropy = (EVAL_STREAM, seed, FAMILIES_INDEX[cell.family], cell.level, cell.first + k, 1)
+        entropy = (EVAL_STREAM, seed, family, cell.level, cell.first + k, 1)
         angle = np.random.default_rng(entropy).uniform(-np.pi, np.pi, pushes)
         result[k, :, 0], result[k, :, 1] = speed * np.cos(angle), speed * np.sin(angle)
     return result
 
 
-FAMILIES_INDEX = {name: i for i, name in enumerate((*FAMILIES, "mixed"))}
+def tile_of(seed: int, family: str, level: int, episode: int) -> Tile:
+    """The tile of one episode, with its start and goal: the same for every policy."""
+    rng = tile_rng(seed, family, level, episode, EVAL_STREAM)
+    return make_tile(family, level / MAX_LEVEL, rng)
 
 
 def run_cell(cell: Cell, low: Policy, driver: Driver, seed: int) -> list[Episode]:
@@ -198,67 +166,91 @@ def run_cell(cell: Cell, low: Policy, driver: Driver, seed: int) -> list[Episode
         seed: of the evaluation's tiles.
 
     Returns:
-        A row an episode, in order.
+        An episode each, in order.
     """
     config, condition = low_config(low), CONDITIONS[cell.condition]
     m = cell.count
-    tiles_ = TileField((m, 1))
-    for k in range(m):
-        rng = tile_rng(seed, cell.family, cell.level, cell.first + k, EVAL_STREAM)
-        tiles_.place(k, 0, make_tile(cell.family, cell.level / MAX_LEVEL, rng))
-    loco = Locomotion(m, config.robot, physics_of(config, condition), tiles_, config.gyro)
     rows = np.arange(m)
-    origin = tiles_.origin(rows, 0)
-    start, goal = tiles_.starts[:, 0], tiles_.goals[:, 0] + origin
+    field = TileField((m, 1))
+    for k in range(m):
+        field.place(k, 0, tile_of(seed, cell.family, cell.level, cell.first + k))
+    field.heights.setflags(write=False)  # for a faster world
+    loco = Locomotion(m, config.robot, physics_of(config, condition), field, config.gyro)
+    world = loco.world
+    origin = field.origin(rows, 0)
+    start, goal = field.starts[:, 0], field.goals[:, 0] + origin
     friction = condition.friction if condition.friction is not None else config.physics.friction
     loco.friction[:], loco.payload[:] = friction, condition.payload
-    loco.world.strength[:] = condition.motor
+    world.strength[:] = condition.motor
     loco.delay[:] = condition.latency
-    loco.world.set_dynamics(rows, loco.friction, loco.payload)
+    world.set_dynamics(rows, loco.friction, loco.payload)
     loco.place(rows, start[:, :2] + origin, start[:, 2], np.zeros(m))
-    driver.begin(loco, goal)
+    driver.begin(loco, goal, cell.family)
 
     dt = config.physics.control_dt
     horizon = round(HORIZON / dt)
-    push_every = round(PUSH_INTERVAL / dt)
+    push_every, pose_every = round(PUSH_INTERVAL / dt), round(POSE_SECONDS / dt)
     pushes = push_velocities(cell, seed, condition.push_speed, horizon // push_every + 1)
     outcome = np.full(m, -1)
     steps = np.zeros(m, dtype=int)
     path = np.zeros(m)
     shares = np.zeros((m, len(GAITS)))
-    world = loco.world
+    actions = np.zeros((m, NUM_JOINTS))
+    poses: list[Array] = []
+
+    def pose() -> Array:
+        state = world.state
+        return np.column_stack([state.position[:, :2] - origin, state.yaw])
+
     try:
         for step in range(horizon):
             live = np.flatnonzero(outcome < 0)
             if condition.push_speed > 0.0 and step > 0 and step % push_every == 0:
                 world.push(live, pushes[live, step // push_every - 1])
+            if step % pose_every == 0:
+                poses.append(pose())
             before = world.state.position[:, :2].copy()
             loco.command[:] = driver.command(step)
-            actions, _ = low.predict(loco.observe())
+            actions[live], _ = low.predict(loco.observe()[live])
             loco.act(actions)
+            if not np.isfinite(world.state.position).all():
+                # Its fellows in Bullet would fall through the ground from now on.
+                raise FloatingPointError(f"{cell}: a robot's position is not finite")
             path[live] += np.linalg.norm(world.state.position[live, :2] - before[live], axis=1)
             shares[live, gait_index(loco.command[live])] += 1.0
             steps[live] = step + 1
-            ended = classify(loco, goal, tiles_)
+            ended = classify(loco, goal, field)
             ended[ended < 0] = -1 if step + 1 < horizon else OUTCOMES.index("timeout")
             done = live[ended[live] >= 0]
             outcome[done] = ended[done]
             if done.size:
-                world.retire(done)
+                world.retire(done)  # whose rows of the state stay as they are
             if (outcome >= 0).all():
                 break
     finally:
         world.close()
+    poses.append(pose())
+    kept = -(-steps // pose_every)  # poses taken while it was up
     return [
         Episode(
-            cell.policy, cell.condition, cell.family, cell.level, cell.first + k, seed,
-            OUTCOMES[outcome[k]], steps[k] * dt, path[k], tuple(shares[k] / steps[k]),
+            cell.policy,
+            cell.condition,
+            cell.family,
+            cell.level,
+            cell.first + k,
+            seed,
+            OUTCOMES[outcome[k]],
+            steps[k] * dt,
+            path[k],
+            tuple(shares[k] / steps[k]),
+            field.goals[k, 0],
+            np.array([p[k] for p in (*poses[: kept[k]], poses[-1])]),
         )
         for k in range(m)
-    ]  # fmt: skip
+    ]
 
 
-def classify(loco: Locomotion, goal: Array, tiles_: TileField) -> NDArray[np.int64]:
+def classify(loco: Locomotion, goal: Array, field: TileField) -> NDArray[np.int64]:
     """Index into OUTCOMES of each robot's present end, -1 for none, (M,).
 
     Failure goes before success: a robot that falls into the goal has fallen.
@@ -268,7 +260,7 @@ def classify(loco: Locomotion, goal: Array, tiles_: TileField) -> NDArray[np.int
     outcome = np.full(loco.num_robots, -1)
     reached = np.linalg.norm(state.position[:, :2] - goal, axis=1) < GOAL_RADIUS
     outcome[reached] = OUTCOMES.index("reached")
-    inside = tiles_.on_tile(np.arange(loco.num_robots), 0, x, y)
+    inside = field.on_tile(np.arange(loco.num_robots), 0, x, y)
     outcome[~inside] = OUTCOMES.index("left_tile")
     outcome[state.trunk_force > TRUNK_FORCE] = OUTCOMES.index("collided")
     fallen = state.position[:, 2] - world.support_height(x, y) < FALL_HEIGHT
@@ -300,15 +292,31 @@ def plan(
     return cells
 
 
-def run_cells(
-    cells: Sequence[Cell], work: Callable[[Cell], list[Episode]], workers: int
-) -> Iterator[list[Episode]]:
-    """``work`` on each cell, in order, on ``workers`` processes."""
-    if workers == 1:
-        yield from map(work, cells)
-        return
-    with one_blas_thread(), mp.get_context("spawn").Pool(workers) as pool:
-        yield from pool.imap(work, cells)
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
+
+
+def keep_memory() -> None:
+    """Let this process keep the memory that it frees, where the C library is glibc.
+
+    A batch's tiles take hundreds of MB. Taking them anew from the system, page by page, was four
+    fifths of the time in which a world is made.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        libc.mallopt(_M_MMAP_MAX, 0)  # all from the heap, none from mappings
+        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)  # and its top is not given back
+
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+
+def spread(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
+    """``work`` on each job, in order, on ``workers`` processes at most."""
+    processes = min(workers, len(jobs))
+    spawn = mp.get_context("spawn")
+    with one_blas_thread(), spawn.Pool(processes, initializer=keep_memory) as pool:
+        yield from pool.imap(work, jobs)
 
 
 def wilson_interval(reached: int, n: int, z: float = 1.959964) -> tuple[float, float]:
@@ -348,6 +356,27 @@ def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:
                 levels["mean"] = _rate(rows)
             families["mean"] = _rate(everything)
     return tree
+
+
+def write_results(folder: Path, episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Write episodes.csv, summary.json and trajectories.npz into ``folder``; returns the summary.
+
+    trajectories.npz holds the tracks in the order of episodes.csv: ``poses`` (N, 3), those of all
+    episodes one after another, ``counts`` (E,), how many are each one's, and ``goals`` (E, 2).
+    """
+    with open(folder / "episodes.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(episodes[0].row()))
+        writer.writeheader()
+        writer.writerows(e.row() for e in episodes)
+    np.savez_compressed(
+        folder / "trajectories.npz",
+        poses=np.concatenate([e.track for e in episodes]).astype(np.float32),
+        counts=np.array([len(e.track) for e in episodes], dtype=np.int32),
+        goals=np.array([e.goal for e in episodes], dtype=np.float32),
+    )
+    summary = summarise(episodes)
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
+    return summary
 
 
 # ---------------------------------------------------------------------------- tracking
@@ -442,11 +471,6 @@ def tracking(low: Policy, episodes: int, seed: int, workers: int) -> dict[str, A
     """tracking.json: each gait's tracking and the falls."""
     robots = max(1, round(_FALL_SHARE * episodes))
     jobs = [(gait, episodes, seed) for gait in GAITS] + [("", robots, seed)]
-    work = functools.partial(_track, low=low)
-    if workers == 1:
-        results = [work(job) for job in jobs]
-    else:
-        with one_blas_thread(), mp.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
-            results = pool.map(work, jobs, chunksize=1)
+    results = list(spread(functools.partial(_track, low=low), jobs, workers))
     falls = results.pop()
     return {"gaits": dict(zip(GAITS, results, strict=True)), **falls}

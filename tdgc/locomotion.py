@@ -139,6 +139,7 @@ class Locomotion:
         self.actions[:, index] = 0.0
         self.targets[:, index] = self.nominal
         self.clock.reset(index, clock)
+        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
 
     def randomise(
         self,

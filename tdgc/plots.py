@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,55 +14,260 @@ import matplotlib
 matplotlib.use("Agg")  # no display needed
 
 import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Patch
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
 
+from tdgc.evaluation import POSE_SECONDS, tile_of
 from tdgc.gaits import GAITS
+from tdgc.low_env import GOAL_RADIUS
+from tdgc.robot import Array, wrap_angle
+from tdgc.terrain import TILE_SIZE
 
-_COLOURS = {"tdgc": "tab:blue", "gp": "tab:orange"}
+# Okabe and Ito's palette, which colour-blind eyes tell apart.
+_COLOURS = {"tdgc": "#0072B2", "gp": "#D55E00"}
+_GAIT_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7")
+_GROUND = LinearSegmentedColormap.from_list("ground", ["#ffffff", "#707070"])  # low to high
+
+_MOVING = 0.1  # m/s, slower than that is no direction of travel (v_th of the high level's rewards)
+_SECTORS = 24  # of 15 degrees
+_DRAWN = 3  # episodes a family and policy in the figure of trajectories
 
 
 def _save(figure: Figure, out: Path) -> None:
-    figure.tight_layout()
     figure.savefig(out, dpi=120)
     plt.close(figure)
 
 
+# ---------------------------------------------------------------------------- evaluation
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """An episode as ``tdgc.evaluation.write_results`` left it: its row, goal (2,), track (n, 3)."""
+
+    row: dict[str, str]
+    goal: Array
+    track: Array
+
+
+def _read(folder: Path) -> list[_Run]:
+    """The episodes of the first condition in a results folder."""
+    with open(folder / "episodes.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    with np.load(folder / "trajectories.npz") as data:
+        tracks = np.split(data["poses"], np.cumsum(data["counts"])[:-1])
+        runs = [_Run(*parts) for parts in zip(rows, data["goals"], tracks, strict=True)]
+    return [run for run in runs if run.row["condition"] == rows[0]["condition"]]
+
+
+def _names(runs: Sequence[_Run], column: str) -> list[str]:
+    """What stands in a column, each once, in order."""
+    return list(dict.fromkeys(run.row[column] for run in runs))
+
+
+def _of(runs: Sequence[_Run], policy: str, family: str) -> list[_Run]:
+    return [r for r in runs if (r.row["policy"], r.row["family"]) == (policy, family)]
+
+
 def success_by_level(summary: Path, out: Path) -> None:
-    """Success by family and level with 95 % intervals, one panel a family (summary.json)."""
+    """Success with 95 % intervals by level (summary.json): a row a condition, a column a family."""
     table: dict[str, Any] = json.loads(summary.read_text(encoding="utf-8"))
-    panels = [
-        (policy, condition, family)
-        for policy, conditions in table.items()
-        for condition, families in conditions.items()
-        for family in families
-        if family != "mean"
-    ]
-    names = list(dict.fromkeys(family for _, _, family in panels))
+    conditions = list(dict.fromkeys(c for rates in table.values() for c in rates))
+    families = {
+        condition: [f for f in next(iter(table.values()))[condition] if f != "mean"]
+        for condition in conditions
+    }
+    columns = max(map(len, families.values()))
     figure, axes = plt.subplots(
-        1, len(names), figsize=(2.6 * len(names) + 0.6, 2.9), sharey=True, squeeze=False
+        len(conditions),
+        columns,
+        figsize=(1.4 + 2.0 * columns, 0.6 + 2.2 * len(conditions)),
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
     )
-    for axis, name in zip(axes[0], names, strict=True):
-        for policy, condition, family in panels:
-            if family != name:
-                continue
-            cells = {k: v for k, v in table[policy][condition][family].items() if k != "mean"}
-            levels = [int(k) for k in cells]
-            rates = [100 * c["rate"] for c in cells.values()]
-            # max: at 0 and 100 % an end of the interval is the rate, but for rounding.
-            below = [100 * max(0.0, c["rate"] - c["ci_low"]) for c in cells.values()]
-            above = [100 * max(0.0, c["ci_high"] - c["rate"]) for c in cells.values()]
-            label = policy if condition == "nominal" else f"{policy}, {condition}"
-            colour = _COLOURS.get(policy) if condition == "nominal" else None
-            axis.errorbar(
-                levels, rates, [below, above], marker="o", capsize=2, label=label, color=colour
-            )
-        axis.set_title(name)
-        axis.set_xlabel("level")
-        axis.grid(alpha=0.3)
-        axis.set_ylim(-3, 103)
-    axes[0, 0].set_ylabel("success (%)")
-    axes[0, -1].legend(fontsize=7)
+    for row, condition in zip(axes, conditions, strict=True):
+        row[0].set_ylabel(f"{condition}\nsuccess (%)")
+        for axis, family in zip(row, families[condition], strict=False):
+            for k, (policy, rates) in enumerate(table.items()):
+                cells = {int(lv): c for lv, c in rates[condition][family].items() if lv != "mean"}
+                middle = np.array([100 * c["rate"] for c in cells.values()])
+                ends = np.array([[c["ci_low"], c["ci_high"]] for c in cells.values()]).T * 100
+                axis.errorbar(
+                    np.array(list(cells)) + 0.16 * (k - 0.5 * (len(table) - 1)),
+                    middle,
+                    # At 0 and 100 % an end of the interval is the rate, but for rounding.
+                    np.maximum(0.0, [middle - ends[0], ends[1] - middle]),
+                    marker="os"[k % 2],
+                    markersize=4,
+                    capsize=2,
+                    label=policy,
+                    color=_COLOURS[policy],
+                )
+                axis.set_xticks(list(cells))
+            axis.set(title=family, xlabel="level", ylim=(-3, 103))
+            axis.grid(alpha=0.3)
+        for axis in row[len(families[condition]) :]:
+            axis.set_axis_off()
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper")
     _save(figure, out)
+
+
+def gait_shares(folder: Path, out: Path) -> None:
+    """Share of the time in each gait by family, a panel a policy."""
+    runs = _read(folder)
+    names, families = _names(runs, "policy"), _names(runs, "family")
+    figure, axes = plt.subplots(
+        1,
+        len(names),
+        figsize=(1.2 + 4.2 * len(names), 1.2 + 0.45 * len(families)),
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )
+    for axis, policy in zip(axes[0], names, strict=True):
+        for y, family in enumerate(families):
+            rows = [run.row for run in _of(runs, policy, family)]
+            seconds = [float(row["time_s"]) for row in rows]
+            shares = [
+                100 * np.average([float(row[f"share_{gait}"]) for row in rows], weights=seconds)
+                for gait in GAITS
+            ]
+            ends = np.cumsum(shares)
+            axis.barh([y] * len(GAITS), shares, left=ends - shares, color=_GAIT_COLOURS)
+            for end, share in zip(ends, shares, strict=True):
+                if share >= 8.0:  # room for the number
+                    axis.text(end - share / 2, y, f"{share:.0f}", ha="center", va="center")
+        axis.set_yticks(range(len(families)), families)
+        axis.set(title=policy, xlabel="share of the time (%)", xlim=(0, 100))
+    axes[0, 0].invert_yaxis()
+    patches = [Patch(color=colour) for colour in _GAIT_COLOURS]
+    figure.legend(patches, GAITS, loc="outside right center")
+    _save(figure, out)
+
+
+def heading_to_travel(track: Array) -> Array:
+    """Heading of the body against the direction it moves in, (k,) rad, while it moves.
+
+    0 is forwards, pi backwards, pi/2 to the body's right: the nose points left of the travel.
+
+    Args:
+        track: (n, 3) as in ``tdgc.evaluation.Episode``; its last pose comes early and is left out.
+    """
+    x, y, yaw = track[:-1].T
+    dx, dy = np.diff(x), np.diff(y)
+    heading = yaw[:-1] + 0.5 * wrap_angle(np.diff(yaw))
+    moving = np.hypot(dx, dy) > _MOVING * POSE_SECONDS
+    return wrap_angle(heading - np.arctan2(dy, dx))[moving]
+
+
+def headings(folder: Path, out: Path) -> None:
+    """Where the nose points against the direction of travel, a row a policy, a column a family."""
+    runs = _read(folder)
+    names, families = _names(runs, "policy"), _names(runs, "family")
+    figure, axes = plt.subplots(
+        len(names),
+        len(families),
+        figsize=(0.6 + 2.4 * len(families), 0.7 + 2.5 * len(names)),
+        squeeze=False,
+        subplot_kw={"projection": "polar"},
+        layout="constrained",
+    )
+    width = 2 * np.pi / _SECTORS
+    edges = np.linspace(-np.pi, np.pi, _SECTORS + 1) + 0.5 * width  # a sector straight ahead
+    for row, policy in zip(axes, names, strict=True):
+        for axis, family in zip(row, families, strict=True):
+            angles = np.concatenate(
+                [heading_to_travel(run.track) for run in _of(runs, policy, family)]
+            )
+            shifted = np.where(angles < edges[0], angles + 2 * np.pi, angles)
+            counts, _ = np.histogram(shifted, edges)
+            shares = 100 * counts / max(1, len(angles))
+            axis.bar(edges[:-1] + 0.5 * width, shares, width, color=_COLOURS[policy], alpha=0.8)
+            axis.set_theta_zero_location("N")
+            axis.set_xticks(np.arange(4) * np.pi / 2, ["ahead", "left", "back", "right"])
+            axis.tick_params(labelsize=7, pad=-1)
+            axis.yaxis.set_major_locator(MaxNLocator(3, integer=True))
+            axis.set_rlabel_position(135)
+            axis.set_title(f"{policy}, {family}", fontsize=9)
+    figure.supxlabel(
+        "Heading of the body against its direction of travel (up); radius: share of that time (%)",
+        fontsize=9,
+    )
+    _save(figure, out)
+
+
+def trajectories(folder: Path, out: Path) -> None:
+    """Bases from above on the hardest level: a row a family, the first episodes of each policy."""
+    runs = [run for run in _read(folder) if int(run.row["episode"]) < _DRAWN]
+    hardest = {run.row["family"]: 0 for run in runs}
+    for run in runs:
+        hardest[run.row["family"]] = max(hardest[run.row["family"]], int(run.row["level"]))
+    runs = [run for run in runs if int(run.row["level"]) == hardest[run.row["family"]]]
+    columns = len(runs) // len(hardest)
+    figure, axes = plt.subplots(
+        len(hardest),
+        columns,
+        figsize=(1.6 + 2.1 * columns, 0.4 + 2.2 * len(hardest)),
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )
+    for row, (family, level) in zip(axes, hardest.items(), strict=True):
+        mine = [run for run in runs if run.row["family"] == family]
+        tiles = [
+            tile_of(int(run.row["seed"]), family, level, int(run.row["episode"])).heights
+            for run in mine
+        ]
+        low, high = float(np.min(tiles)), float(np.max(tiles))
+        for axis, run, heights in zip(row, mine, tiles, strict=True):
+            ground = axis.imshow(
+                heights.T,
+                origin="lower",
+                extent=(0, TILE_SIZE, 0, TILE_SIZE),
+                cmap=_GROUND,
+                vmin=low,
+                vmax=high,
+            )
+            _draw_track(axis, run)
+        row[0].set_ylabel(f"{family}, level {level}\ny (m)")
+        figure.colorbar(ground, ax=row, label="height (m)", shrink=0.9, pad=0.01)
+    for axis in axes[-1]:
+        axis.set_xlabel("x (m)")
+    axes[0, 0].set(xlim=(0, TILE_SIZE), ylim=(0, TILE_SIZE))
+    figure.supxlabel(
+        "Arrows: heading of the body, once a second. Cross: end of an episode that did not reach "
+        "the goal (dashed).",
+        fontsize=9,
+    )
+    _save(figure, out)
+
+
+def _draw_track(axis: Any, run: _Run) -> None:
+    """The base's way, its heading once a second, the goal, and how the episode ended."""
+    colour, white = _COLOURS[run.row["policy"]], [withStroke(linewidth=3.5, foreground="white")]
+    x, y, yaw = run.track.T
+    axis.plot(x, y, color=colour, linewidth=1.6, path_effects=white)
+    second = slice(None, None, round(1.0 / POSE_SECONDS))
+    axis.quiver(
+        x[second], y[second], np.cos(yaw[second]), np.sin(yaw[second]),
+        color=colour, scale=14, width=0.012, headwidth=4, zorder=3,
+    )  # fmt: skip
+    axis.plot(x[0], y[0], "o", color=colour, markersize=5)
+    if run.row["outcome"] != "reached":
+        axis.plot(x[-1], y[-1], "X", color="black", markersize=7, clip_on=False)
+    axis.add_patch(Circle(tuple(run.goal), GOAL_RADIUS, fill=False, linestyle="--"))
+    outcome = run.row["outcome"].replace("_", " ")
+    axis.set_title(f"{run.row['policy']}: {outcome}, {float(run.row['time_s']):.1f} s", fontsize=8)
+
+
+# ---------------------------------------------------------------------------- training
 
 
 def training_curve(log: Path, out: Path) -> None:
@@ -72,7 +280,7 @@ def training_curve(log: Path, out: Path) -> None:
         if points:
             axis.plot(*zip(*points, strict=True), label=label)
 
-    figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True)
+    figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
     panels = [
         ("reward a step", [("reward/total", "total")]),
         ("velocity RMSE (m/s)", [(f"tracking/{g}_velocity_rmse", g) for g in GAITS]),
@@ -86,7 +294,7 @@ def training_curve(log: Path, out: Path) -> None:
             draw(axis, key, label)
         axis.set_title(title)
         axis.grid(alpha=0.3)
-        if len(series) > 1:
+        if len(axis.lines) > 1:
             axis.legend(fontsize=7)
     for axis in axes[1]:
         axis.set_xlabel("million control steps")

@@ -8,6 +8,8 @@ files, ``policy.safetensors`` with ``policy.json`` (the last policy, ready to be
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import errno
 import hashlib
 import json
 import os
@@ -33,7 +35,7 @@ from tqdm import tqdm
 
 from tdgc import __version__, policies
 from tdgc.config import Config, ConfigError, from_dict, to_dict, with_overrides
-from tdgc.vec import TaskVecEnv
+from tdgc.vec import TaskVecEnv, WorkerError
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
 
@@ -65,36 +67,50 @@ def _restore_random(tensors: dict[str, th.Tensor], states: dict[str, Any]) -> No
     random.setstate((version, tuple(tensors["random.python"].tolist()), carry))
 
 
-def save_checkpoint(folder: Path, model: BaseAlgorithm, extra: dict[str, Any]) -> Path:
-    """Write the learner's whole state; a reader sees it complete or not at all."""
+def snapshot(
+    model: BaseAlgorithm, extra: dict[str, Any]
+) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
+    """The learner's whole state and ``extra`` as tensors and header, see ``load_learner``."""
     tensors = {f"policy.{k}": v for k, v in model.policy.state_dict().items()}
     optimiser = model.policy.optimizer.state_dict()
     for index, slots in optimiser["state"].items():
         tensors |= {f"optimizer.{index}.{k}": th.as_tensor(v) for k, v in slots.items()}
     random_tensors, random_states = _random_states()
-    tensors |= random_tensors
-    data = safetensors.torch.save({k: v.contiguous() for k, v in tensors.items()})
     header = {
         "format": "tdgc-checkpoint",
         "version": 1,
         "code": __version__,
-        "sha256": hashlib.sha256(data).hexdigest(),
         "num_timesteps": model.num_timesteps,
         "n_updates": model._n_updates,
         "random": random_states,
         **extra,
     }
-    final = folder / f"step-{model.num_timesteps:012d}"
+    return tensors | random_tensors, header
+
+
+def save_checkpoint(folder: Path, tensors: dict[str, th.Tensor], header: dict[str, Any]) -> Path:
+    """Write a snapshot; a reader sees it complete or not at all.
+
+    Raises:
+        OSError: it cannot be written; those before it are left as they are.
+    """
+    data = safetensors.torch.save({k: v.contiguous() for k, v in tensors.items()})
+    text = json.dumps({**header, "sha256": hashlib.sha256(data).hexdigest()})
+    final = folder / f"step-{header['num_timesteps']:012d}"
     partial = folder / f".{final.name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    for name, content in (("state.safetensors", data), ("state.json", json.dumps(header).encode())):
-        with open(partial / name, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-    shutil.rmtree(final, ignore_errors=True)
-    os.replace(partial, final)
+    try:
+        for name, content in (("state.safetensors", data), ("state.json", text.encode())):
+            with open(partial / name, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        shutil.rmtree(final, ignore_errors=True)
+        os.replace(partial, final)
+    except OSError:
+        shutil.rmtree(partial, ignore_errors=True)  # it may be what fills the disk
+        raise
     for old in sorted(folder.glob("step-*"))[:-_KEEP]:
         shutil.rmtree(old)
     return final
@@ -199,6 +215,9 @@ class RunCallback(BaseCallback):
         interruption: when to stop.
         log_steps, checkpoint_steps: control steps between log rows and between checkpoints.
         seconds_before: wall time of the run so far.
+
+    Attributes:
+        unsaved: why the last checkpoint could not be written, or None.
     """
 
     def __init__(
@@ -224,6 +243,9 @@ class RunCallback(BaseCallback):
         self._saved_at = 0
         self._logged_at = (0, 0.0)
         self._bar: Any = None
+        self._faults: list[dict[str, Any]] = []  # since the last log row
+        self._tensorboard_failed = False
+        self.unsaved: OSError | None = None
 
     @property
     def seconds(self) -> float:
@@ -249,7 +271,15 @@ class RunCallback(BaseCallback):
             self.checkpoint()
 
     def _on_step(self) -> bool:
+        self.tell_faults()
         return True
+
+    def tell_faults(self) -> None:
+        """Tell of the workers that were started anew, and keep it for the next log row."""
+        while self.env.faults:
+            fault = self.env.faults.pop(0)
+            tqdm.write(str(fault))
+            self._faults.append({"steps": self.num_timesteps, **dataclasses.asdict(fault)})
 
     def _on_rollout_end(self) -> None:
         self._bar.update(self.num_timesteps - self._bar.n)
@@ -258,14 +288,26 @@ class RunCallback(BaseCallback):
 
     def checkpoint(self) -> None:
         """Save everything and start all episodes anew, as a resumed run would."""
-        states = self.env.state_dicts()
-        extra = {"workers": states, "seconds": self.seconds, "phase": self.phase}
-        save_checkpoint(self.run / "checkpoints", self.model, extra)
-        meta = {**self.meta, "steps": self.num_timesteps, "seconds": round(self.seconds)}
-        policy = cast(ActorCriticPolicy, self.model.policy)
-        policies.save(self.run / "policy", policy, meta)
+        self.save()
         restart(self.model, self.env)
         self._saved_at = self.num_timesteps
+
+    def save(self) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
+        """Write the policy and a checkpoint, or tell why not; returns the snapshot."""
+        states = self.env.state_dicts()
+        extra = {"workers": states, "seconds": self.seconds, "phase": self.phase}
+        taken = snapshot(self.model, extra)
+        steps = self.model.num_timesteps
+        meta = {**self.meta, "steps": steps, "seconds": round(self.seconds)}
+        try:
+            # The policy first: it is refused when it is not finite, and a checkpoint should be.
+            policies.save(self.run / "policy", cast(ActorCriticPolicy, self.model.policy), meta)
+            save_checkpoint(self.run / "checkpoints", *taken)
+            self.unsaved = None
+        except OSError as error:
+            self.unsaved = error
+            tqdm.write(f"no checkpoint at {steps} steps, the one before stays: {error}")
+        return taken
 
     def _log(self) -> None:
         sums: dict[str, float] = {}
@@ -286,12 +328,21 @@ class RunCallback(BaseCallback):
             number = self.logger.name_to_value.get(f"train/{name}")
             if number is not None:
                 values[f"train/{name}"] = float(number)
-        for key, value in values.items():
-            self.logger.record(key, value)
-        self.logger.dump(self.num_timesteps)
-        row = {"steps": self.num_timesteps, "seconds": round(self.seconds, 1), **values}
-        with open(self.run / "log.jsonl", "a", encoding="utf-8") as file:
-            file.write(json.dumps({k: _short(v) for k, v in row.items()}) + "\n")
+        values["faults/blow_ups"] = sums.get("blow_ups", 0.0)
+        values["faults/restarts"] = float(len(self._faults))
+        row: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self.seconds, 1)}
+        row |= {k: _short(v) for k, v in values.items()} | {"faults": self._faults}
+        try:
+            append_line(self.run / "log.jsonl", json.dumps(row))
+            if self._tensorboard_failed:  # its writer never recovers from an error
+                self.model.set_logger(tensorboard_logger(self.run / "tensorboard"))
+            for key, value in values.items():
+                self.logger.record(key, value)
+            self.logger.dump(self.num_timesteps)
+            self._faults, self._tensorboard_failed = [], False
+        except OSError as error:
+            self._tensorboard_failed = True
+            tqdm.write(f"no log row at {self.num_timesteps} steps: {error}")
         self._logged_at = (self.num_timesteps, self.seconds)
 
     def _on_training_end(self) -> None:
@@ -299,7 +350,21 @@ class RunCallback(BaseCallback):
 
 
 def _short(value: float) -> float:
-    return float(f"{value:.5g}") if isinstance(value, float) else value
+    return float(f"{value:.5g}")
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a file, all of it or nothing.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    data = f"{line}\n".encode()
+    with open(path, "ab", buffering=0) as file:
+        end = file.tell()
+        if file.write(data) < len(data):  # the disk had room for a part
+            file.truncate(end)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def restart(model: BaseAlgorithm, env: TaskVecEnv) -> None:
@@ -314,15 +379,25 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
 
     Like ``OnPolicyAlgorithm.learn``, but it stops between two updates and never inside one, so
     that a checkpoint written then is whole.
+
+    Raises:
+        WorkerError: too many faults of workers; the learner is as after the last update.
     """
     model._total_timesteps = until
     callback.init_callback(model)
     callback.on_training_start(locals(), globals())
-    while model.num_timesteps < until and not callback.interruption.due():
-        model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
-        model._update_current_progress_remaining(model.num_timesteps, until)
-        model.train()
-    callback.on_training_end()
+    updated_at = model.num_timesteps
+    try:
+        while model.num_timesteps < until and not callback.interruption.due():
+            model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+            model._update_current_progress_remaining(model.num_timesteps, until)
+            model.train()
+            updated_at = model.num_timesteps
+    except WorkerError:
+        model.num_timesteps = updated_at  # nothing was learned from the steps since
+        raise
+    finally:
+        callback.on_training_end()
     return bool(model.num_timesteps >= until)
 
 
@@ -354,11 +429,11 @@ class Phase:
     """A stretch of a run with its own environment.
 
     Attributes:
-        build: makes the learner and its workers.
+        build: makes the learner and its workers, given their ``timeout``.
         until: steps of the run at which the phase ends.
     """
 
-    build: Callable[[], tuple[Any, TaskVecEnv]]
+    build: Callable[[float], tuple[Any, TaskVecEnv]]
     until: int
 
 
@@ -367,6 +442,10 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
     parser.add_argument("--seed", type=int, help="of everything random (42)")
     parser.add_argument("--n-envs", type=int, help="robots altogether")
     parser.add_argument("--workers", type=int, help="processes that simulate")
+    parser.add_argument(
+        "--worker-timeout", type=float, default=300.0, metavar="S",
+        help="start a worker anew that is silent for S seconds (300)",
+    )  # fmt: skip
     parser.add_argument("--steps", type=int, help="steps altogether")
     parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds")
     parser.add_argument("--device", default="cpu", help="where the learner runs (cpu)")
@@ -416,6 +495,8 @@ def run(
     Raises:
         CheckpointError: nothing to resume that can be read.
         ValueError: a policy of ``--init`` that does not fit.
+        WorkerError: too many faults of workers; a checkpoint was written.
+        OSError: files that cannot be written, among them the last checkpoint.
     """
     carried = newest_checkpoint(args.out, tqdm.write) if args.resume else None
     if args.init is not None:
@@ -424,10 +505,11 @@ def run(
     (args.out / "config.json").write_text(json.dumps(to_dict(config), indent=2), encoding="utf-8")
     interruption = Interruption(args.time_limit)
     seconds = float(carried[1]["seconds"]) if carried else 0.0
+    finished, unsaved = True, None
     for number, phase in enumerate(phases):
         if carried is not None and int(carried[1]["num_timesteps"]) >= phase.until:
             continue
-        model, env = phase.build()
+        model, env = phase.build(args.worker_timeout)
         try:
             model.set_logger(tensorboard_logger(args.out / "tensorboard"))
             callback = RunCallback(
@@ -441,13 +523,20 @@ def run(
             elif args.init is not None:
                 policies.load_into(args.init, model.policy)
             restart(model, env)
-            finished = learn(model, callback, phase.until)
-            callback.checkpoint()
-            carried = newest_checkpoint(args.out, tqdm.write)
-            seconds = callback.seconds
+            try:
+                finished = learn(model, callback, phase.until)
+            except WorkerError:
+                callback.tell_faults()
+                callback.save()
+                raise
+            carried = callback.save()
+            seconds, unsaved = callback.seconds, callback.unsaved
         finally:
             env.close()
         if not finished:
-            tqdm.write(f"stopped by {interruption.reason}; --resume --out {args.out} goes on")
-            return False
-    return True
+            break
+    if unsaved is not None:
+        raise unsaved
+    if not finished:
+        tqdm.write(f"stopped by {interruption.reason}; --resume --out {args.out} goes on")
+    return finished

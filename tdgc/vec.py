@@ -1,18 +1,24 @@
 """Many robots in a few worker processes behind Stable-Baselines3's VecEnv.
 
 Each worker holds one task of some robots. Actions, observations, rewards and flags live in shared
-memory that dies with its processes; the pipes carry single words and now and then a state.
+memory that dies with its processes; the pipes carry single words and now and then a state. Robots
+that blow up are reset where they are simulated, and a worker that fails can be started anew.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import itertools
 import multiprocessing as mp
 import os
 import signal
+import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
 from typing import Any, Protocol
@@ -22,9 +28,21 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
+#: Observations and rewards are scaled to be of order one; beyond this a robot has blown up. For the
+#: low level it means 50 m/s, 400 rad/s or 10 m above the ground.
+SANE = 100.0
+#: Faults of workers within so many steps that stop a run. A fault of the code comes back at once
+#: or in every episode, and the low level's last 1000 steps; one of the machine does not.
+FAULTS, FAULT_STEPS = 3, 1000
+# s to start in: ten times what imports and 60 robots' worlds took on a core shared by ten.
+_START_SECONDS = 600.0
+
 
 class Task(Protocol):
-    """An MDP of M robots, as ``tdgc.low_env.LowLevelTask`` is one."""
+    """An MDP of M robots, as ``tdgc.low_env.LowLevelTask`` is one.
+
+    ``state_dict()["rng"]`` is the state of all that is random in it.
+    """
 
     num_robots: int
     actor_dim: int
@@ -54,12 +72,34 @@ MakeTask = Callable[[int, int], Task]  # (number of robots, seed) -> task
 
 
 class WorkerError(RuntimeError):
-    """A worker failed; the message carries its own traceback."""
+    """A worker died, hung or raised; the message carries its own traceback if it has one."""
 
 
-def worker_seed(seed: int, worker: int) -> int:
-    """Seed of one worker's task, below 2**32."""
-    return int(np.random.SeedSequence([seed, worker]).generate_state(1)[0])
+@dataclass(frozen=True)
+class Fault:
+    """A fault that was mended by a new worker.
+
+    Attributes:
+        worker: its number.
+        reason: how it failed, with its own traceback if it has one.
+        restarts: how often this worker has been started anew by now.
+        seed: of the new worker's task, see ``worker_seed``.
+    """
+
+    worker: int
+    reason: str
+    restarts: int
+    seed: int
+
+    def __str__(self) -> str:
+        lines = self.reason.splitlines()
+        reason = " ".join(dict.fromkeys((lines[0], lines[-1])))
+        return f"{reason}; started anew with seed {self.seed} (restart {self.restarts})"
+
+
+def worker_seed(seed: int, worker: int, restarts: int = 0) -> int:
+    """Seed of one worker's task, below 2**32; another one after each restart."""
+    return int(np.random.SeedSequence([seed, worker, restarts]).generate_state(1)[0])
 
 
 class _Shared:
@@ -88,31 +128,82 @@ class _Shared:
         return views
 
 
-def _work(pipe: Connection, make_task: MakeTask, rows: slice, seed: int, shared: _Shared) -> None:
-    """A worker's life: answer one word at a time until told to close or the pipe ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is the parent's to answer
+def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
+    """One step of a worker's robots; those whose episode ended are reset.
+
+    A robot that blew up gets no reward and is truncated, with its observation before the step as
+    the last one. Returns how many did.
+
+    Raises:
+        FloatingPointError: the task is not finite even after a reset.
+    """
+    reward, terminated, truncated = task.step(views["actions"])
+    obs = task.observe()
+    blown = ~((np.abs(obs) <= SANE).all(axis=1) & (np.abs(reward) <= SANE))
+    # A robot with a NaN leaves Bullet's broad phase in disorder for good: the others of its client
+    # fall through the ground. So the worlds are built anew, which ends every episode in them.
+    poisoned = not (np.isfinite(obs).all() and np.isfinite(reward).all())
+    obs[blown], reward[blown] = views["obs"][blown], 0.0
+    terminated &= ~blown
+    truncated |= blown | (poisoned & ~terminated)
+    done = np.flatnonzero(terminated | truncated)
+    if done.size:
+        views["last_obs"][done] = obs[done]
+        if poisoned:
+            task.take_stats()  # its sums are not finite either
+            task.restart()
+        else:
+            task.reset(done)
+        obs[done] = task.observe()[done]
+        if not np.isfinite(obs).all():
+            raise FloatingPointError("observations are not finite after a reset")
+    views["obs"][:] = obs
+    views["rewards"][:] = reward
+    views["terminated"][:] = terminated
+    views["truncated"][:] = truncated
+    return int(blown.sum())
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has, whatever it is busy with."""
+    parent = mp.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _work(
+    pipe: Connection,
+    make_task: MakeTask,
+    rows: slice,
+    seed: int,
+    shared: _Shared,
+    state: dict[str, Any] | None = None,
+) -> None:
+    """A worker's life: tell its state, then answer one word at a time until told to close.
+
+    With the ``state`` of a worker that failed it takes over all but the randomness, and restarts.
+    """
+    # What a terminal or a batch system sends to all processes is the parent's to answer.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     task: Task | None = None
     try:
         views = {name: view[rows] for name, view in shared.arrays().items()}
         task = make_task(rows.stop - rows.start, seed)
-        busy = 0.0
-        pipe.send(None)
+        if state is not None:
+            task.load_state_dict({**state, "rng": task.state_dict()["rng"]})
+            task.restart()
+            views["obs"][:] = task.observe()
+        busy, blow_ups = 0.0, 0
+        pipe.send(task.state_dict())
         while True:
             word, argument = pipe.recv()
             started = time.perf_counter()
             answer: Any = None
             if word == "step":
-                reward, terminated, truncated = task.step(views["actions"])
-                obs = task.observe()
-                done = np.flatnonzero(terminated | truncated)
-                if done.size:
-                    views["last_obs"][done] = obs[done]
-                    task.reset(done)
-                    obs[done] = task.observe()[done]
-                views["obs"][:] = obs
-                views["rewards"][:] = reward
-                views["terminated"][:] = terminated
-                views["truncated"][:] = truncated
+                blow_ups += _step(task, views)
             elif word == "restart":
                 task.restart()
                 views["obs"][:] = task.observe()
@@ -121,7 +212,8 @@ def _work(pipe: Connection, make_task: MakeTask, rows: slice, seed: int, shared:
             elif word == "state":
                 answer = task.state_dict()
             elif word == "stats":
-                answer = {**task.take_stats(), "busy_seconds": busy}
+                answer = {**task.take_stats(), "busy_seconds": busy, "blow_ups": float(blow_ups)}
+                blow_ups = 0
             elif word == "close":
                 pipe.send(None)
                 return
@@ -163,15 +255,25 @@ class TaskVecEnv(VecEnv):
     Robots whose episode ended are reset within ``step``; ``infos`` holds their last observation
     and whether they were truncated, as SB3 expects.
 
+    With ``recover`` a worker that dies, hangs or raises is started anew from its last known state
+    (see ``state_dicts``) with a seed of its own; its robots' episodes end, truncated, with no
+    reward for the step. ``FAULTS`` faults within ``FAULT_STEPS`` steps are raised all the same.
+
     Args:
         make_task: picklable, called in each worker as ``make_task(robots, seed)``.
         num_envs: robots altogether.
         workers: processes; the robots are shared out evenly.
         seed: from which each worker's seed is drawn.
         spaces: observation and action space of the task.
+        recover: start workers that fail anew; otherwise the first fault is raised.
+        timeout: s without an answer after which a worker counts as hung. Of all that is asked,
+            building the worlds of 60 robots on terrain takes longest: 3 s of a core.
+
+    Attributes:
+        faults: those mended so far; whoever tells of them takes them out.
 
     Raises:
-        ValueError: fewer robots than workers, or no worker.
+        ValueError: fewer robots than workers, no worker, or no timeout.
         WorkerError: a worker failed while starting.
     """
 
@@ -182,72 +284,140 @@ class TaskVecEnv(VecEnv):
         workers: int,
         seed: int,
         spaces: tuple[gym.spaces.Box, gym.spaces.Box],
+        recover: bool = False,
+        timeout: float = 300.0,
     ) -> None:
         if not 1 <= workers <= num_envs:
             raise ValueError(f"workers must be 1 to the {num_envs} robots, not {workers}")
+        if not timeout > 0.0:
+            raise ValueError(f"the workers' timeout must be above 0 s, not {timeout:g}")
         super().__init__(num_envs, *spaces)
+        self.timeout = timeout
+        self.faults: list[Fault] = []
+        self._make_task, self._seed, self._recover = make_task, seed, recover
         self._shared = _Shared(num_envs, spaces[0].shape[0], spaces[1].shape[0])
         self._views = self._shared.arrays()
-        context = mp.get_context("spawn")
-        bounds = np.linspace(0, num_envs, workers + 1).astype(int)
+        bounds = np.linspace(0, num_envs, workers + 1).astype(int).tolist()
+        self._rows = [slice(*ends) for ends in itertools.pairwise(bounds)]
+        self._restarts = [0] * workers
+        self._broken: dict[int, WorkerError] = {}  # workers that failed and were not mended yet
+        self._steps = 0
+        self._fault_steps = deque([-FAULT_STEPS] * FAULTS, maxlen=FAULTS)  # the last faults' steps
         self._pipes: list[Connection] = []
-        self._processes = []
+        self._processes: list[Any] = []
+        atexit.register(self.close)  # or the interpreter would wait for the workers at its end
         for k in range(workers):
-            ours, theirs = context.Pipe()
-            rows = slice(int(bounds[k]), int(bounds[k + 1]))
-            process = context.Process(
-                target=_work,
-                args=(theirs, make_task, rows, worker_seed(seed, k), self._shared),
-                daemon=True,
-                name=f"tdgc-worker-{k}",
-            )
-            with one_blas_thread():
-                process.start()
-            theirs.close()
-            self._pipes.append(ours)
+            pipe, process = self._start(k)
+            self._pipes.append(pipe)
             self._processes.append(process)
-        try:
-            for k in range(workers):
-                self._receive(k)
-        except WorkerError:
+        # The last known ones; a worker begins by telling its own.
+        self._states = [self._receive(k, _START_SECONDS) for k in range(workers)]
+        if self._broken:
             self.close()
-            raise
+            raise self._broken[min(self._broken)]
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
 
-    def _death(self, worker: int) -> WorkerError:
-        process = self._processes[worker]
-        process.join(timeout=5.0)  # its pipe closes a moment before it ends
-        return WorkerError(f"worker {worker} died (exit code {process.exitcode})")
+    # ------------------------------------------------------------------ the workers
 
-    def _send(self, worker: int, word: str, argument: Any = None) -> None:
-        try:
-            self._pipes[worker].send((word, argument))
-        except OSError as error:
-            raise self._death(worker) from error
+    def _start(self, worker: int, state: dict[str, Any] | None = None) -> tuple[Connection, Any]:
+        context = mp.get_context("spawn")
+        ours, theirs = context.Pipe()
+        seed = worker_seed(self._seed, worker, self._restarts[worker])
+        process = context.Process(
+            target=_work,
+            args=(theirs, self._make_task, self._rows[worker], seed, self._shared, state),
+            daemon=True,
+            name=f"tdgc-worker-{worker}",
+        )
+        with one_blas_thread():
+            process.start()
+        theirs.close()
+        return ours, process
+
+    def _replace(self, worker: int, restarts: int, state: dict[str, Any] | None = None) -> None:
+        """Put a new process in a worker's place; it has to be waited for."""
+        self._processes[worker].kill()
+        self._processes[worker].join()
+        self._pipes[worker].close()
+        self._broken.pop(worker, None)
+        self._restarts[worker] = restarts
+        self._pipes[worker], self._processes[worker] = self._start(worker, state)
 
     @property
     def worker_pids(self) -> list[int]:
         """Process numbers of the workers."""
-        return [process.pid for process in self._processes if process.pid is not None]
+        return [process.pid for process in self._processes]
 
-    def _receive(self, worker: int) -> Any:
+    def _send(self, worker: int, word: str, argument: Any = None) -> None:
+        with contextlib.suppress(OSError):  # that it is gone is seen when its answer is wanted
+            self._pipes[worker].send((word, argument))
+
+    def _receive(self, worker: int, timeout: float) -> Any:
+        """A worker's answer; or the ``WorkerError``, which stays until the worker is replaced."""
+        if worker in self._broken:
+            return self._broken[worker]
         try:
-            answer = self._pipes[worker].recv()
-        except (EOFError, OSError) as error:
-            raise self._death(worker) from error
-        if isinstance(answer, WorkerError):
-            raise WorkerError(f"worker {worker} failed:\n{answer}")
-        return answer
+            if not self._pipes[worker].poll(timeout):
+                fault = WorkerError(f"worker {worker} gave no answer for {timeout:g} s")
+            elif isinstance(answer := self._pipes[worker].recv(), WorkerError):
+                fault = WorkerError(f"worker {worker} failed:\n{answer}")
+            else:
+                return answer
+        except (EOFError, OSError):
+            process = self._processes[worker]
+            process.join(timeout=5.0)  # its pipe closes a moment before it ends
+            fault = WorkerError(f"worker {worker} died (exit code {process.exitcode})")
+        self._broken[worker] = fault
+        return fault
 
-    def _ask(self, word: str, arguments: Sequence[Any] | None = None) -> list[Any]:
+    def _receive_all(self) -> list[Any]:
+        """Every worker's answer, or its ``WorkerError``.
+
+        Raises:
+            WorkerError: one failed, and no worker is to be started anew.
+        """
+        answers = [self._receive(k, self.timeout) for k in range(len(self._pipes))]
+        if self._broken and not self._recover:
+            raise self._broken[min(self._broken)]
+        return answers
+
+    def _ask(self, word: str) -> list[Any]:
         for k in range(len(self._pipes)):
-            self._send(k, word, None if arguments is None else arguments[k])
-        return [self._receive(k) for k in range(len(self._pipes))]
+            self._send(k, word)
+        return self._receive_all()
+
+    def _mend(self) -> NDArray[np.bool_]:
+        """Start the broken workers anew; their robots have new observations.
+
+        Returns:
+            (num_envs,) the robots concerned.
+
+        Raises:
+            WorkerError: there were too many faults.
+        """
+        concerned = np.zeros(self.num_envs, dtype=bool)
+        while self._broken:
+            worker, fault = next(iter(self._broken.items()))
+            self._fault_steps.append(self._steps)
+            if self._steps - self._fault_steps[0] < FAULT_STEPS:
+                raise WorkerError(
+                    f"{FAULTS} faults of workers within {FAULT_STEPS} steps; the last one: {fault}"
+                )
+            restarts = self._restarts[worker] + 1
+            self._replace(worker, restarts, self._states[worker])
+            seed = worker_seed(self._seed, worker, restarts)
+            self.faults.append(Fault(worker, str(fault), restarts, seed))
+            self._receive(worker, _START_SECONDS)
+            concerned[self._rows[worker]] = True
+        return concerned
+
+    # ------------------------------------------------------------------ as SB3 wants it
 
     def reset(self) -> NDArray[np.float32]:
         """End all episodes, rebuild the worlds and return the first observations."""
         self._ask("restart")
+        self._mend()
         self._returns[:] = 0.0
         self._lengths[:] = 0
         return self._views["obs"].copy()
@@ -258,9 +428,15 @@ class TaskVecEnv(VecEnv):
             self._send(k, "step")
 
     def step_wait(self) -> Any:
-        for k in range(len(self._pipes)):
-            self._receive(k)
+        self._receive_all()
+        self._steps += 1
         views = self._views
+        if self._broken:
+            seen = views["obs"].copy()
+            lost = self._mend()
+            views["last_obs"][lost] = seen[lost]
+            views["rewards"][lost] = 0.0
+            views["terminated"][lost], views["truncated"][lost] = False, True
         self._returns += views["rewards"]
         self._lengths += 1
         terminated = views["terminated"].astype(bool)
@@ -277,30 +453,52 @@ class TaskVecEnv(VecEnv):
         return views["obs"].copy(), views["rewards"].copy(), done, infos
 
     def stats(self) -> list[dict[str, float]]:
-        """Each worker's sums since the last call, see ``Task.take_stats``."""
-        return self._ask("stats")
+        """Each worker's sums since the last call, see ``Task.take_stats``, and ``blow_ups``.
+
+        A broken worker's are lost.
+        """
+        return [sums for sums in self._ask("stats") if not isinstance(sums, WorkerError)]
 
     def state_dicts(self) -> list[dict[str, Any]]:
-        """Each worker's state, from which ``reset`` gives the same future."""
-        return self._ask("state")
+        """Each worker's state, from which ``reset`` gives the same future, and its ``restarts``.
+
+        A broken worker's is its last known one.
+        """
+        for k, state in enumerate(self._ask("state")):
+            if not isinstance(state, WorkerError):
+                self._states[k] = state
+        return [
+            {**state, "restarts": restarts}
+            for state, restarts in zip(self._states, self._restarts, strict=True)
+        ]
 
     def load_state_dicts(self, states: list[dict[str, Any]]) -> None:
         """Take over the workers' states; call ``reset`` afterwards.
 
         Raises:
             ValueError: states of another number of workers.
+            WorkerError: a worker failed.
         """
         if len(states) != len(self._pipes):
             raise ValueError(f"states of {len(states)} workers do not fit {len(self._pipes)}")
-        self._ask("load", states)
+        for k, state in enumerate(states):
+            restarts = state.get("restarts", 0)
+            if restarts != self._restarts[k]:  # its seed is another one
+                self._replace(k, restarts)
+                self._receive(k, _START_SECONDS)
+            self._send(k, "load", state)
+        self._receive_all()
+        if self._broken:
+            raise self._broken[min(self._broken)]
+        self._states = list(states)
 
     def close(self) -> None:
         """Stop the workers, gently and then not."""
-        for pipe in self._pipes:
-            with contextlib.suppress(OSError):
-                pipe.send(("close", None))
-        for process in self._processes:
-            process.join(timeout=5.0)
+        atexit.unregister(self.close)
+        for k in range(len(self._pipes)):
+            self._send(k, "close")
+        for k, process in enumerate(self._processes):
+            process.join(timeout=0.0 if k in self._broken else 5.0)
             if process.is_alive():
                 process.kill()
                 process.join()

@@ -63,7 +63,7 @@ class World:
     """M robots on a plane, or each on a tile row of its own in a field.
 
     Robots are spread over several Bullet clients, ``CLIENT_ROBOTS`` in each; a client holds its own
-    robots' part of the field only. ``visual`` keeps what is needed to draw the ground.
+    robots' part of the field only. ``visual`` keeps what is needed for pictures.
 
     Attributes:
         state: the ``RobotState`` after the last step or reset.
@@ -120,24 +120,29 @@ class World:
             n = TILE_SAMPLES
             client.samples = slice(client.first_row * n, (client.first_row + count) * n)
             heights = self.field.heights[client.samples]
-            # The first upload fixes the height range that Bullet keeps, so it spans all that
-            # tiles can ever be; the second brings the heights.
-            spanning = np.zeros_like(heights)
-            spanning[0, 0], spanning[0, 1] = HEIGHT_RANGE
-            client.shape = self._upload(client, spanning, -1)
+            low, high = float(heights.min()), float(heights.max())
+            if heights.flags.writeable:
+                # The first upload fixes the height range that Bullet keeps, so it spans all that
+                # tiles can ever be; the second brings the heights.
+                low, high = HEIGHT_RANGE
+                spanning = np.zeros_like(heights)
+                spanning[0, 0], spanning[0, 1] = HEIGHT_RANGE
+                client.shape = self._upload(client, spanning, -1)
+                self._upload(client, heights, client.shape)
+            else:
+                client.shape = self._upload(client, heights, -1)
             nx, ny = heights.shape
             cell = self.field.cell
             centre = [
                 (client.samples.start + 0.5 * (nx - 1)) * cell,
                 0.5 * (ny - 1) * cell,
-                0.5 * (HEIGHT_RANGE[0] + HEIGHT_RANGE[1]),
+                0.5 * (low + high),
             ]
             # Without a visual of its own, Bullet keeps 360 bytes a sample to draw the field.
             drawn = -1
             if not self._visual:
                 drawn = client.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001)
             client.ground = client.createMultiBody(0.0, client.shape, drawn, basePosition=centre)
-            self._upload(client, heights, client.shape)
         client.changeDynamics(client.ground, -1, lateralFriction=1.0)  # feet carry the friction
         client.setCollisionFilterGroupMask(client.ground, -1, _GROUND, _ROBOT)
 
@@ -179,7 +184,8 @@ class World:
         body = client.loadURDF(
             str(urdf_path(self.robot)),
             basePosition=[2.0 * place, 0.0, 50.0],
-            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE
+            | (0 if self._visual else pybullet.URDF_IGNORE_VISUAL_SHAPES),
         )
         found = {
             client.getJointInfo(body, j)[1].decode(): j for j in range(client.getNumJoints(body))
@@ -342,8 +348,8 @@ class World:
     ) -> NDArray[np.uint8]:
         """Robot ``row`` and its ground from the side, (height, width, 3), without a display.
 
-        ``azimuth`` is where the camera stands, rad from the world's x axis. Terrain is drawn in
-        worlds made with ``visual`` only.
+        ``azimuth`` is where the camera stands, rad from the world's x axis. Worlds that were not
+        made with ``visual`` have nothing to show.
         """
         client, target = self._client_of[row], self.state.position[row]
         eye = target + [1.3 * np.cos(azimuth), 1.3 * np.sin(azimuth), 0.45]

@@ -1,23 +1,26 @@
-"""The protocol: outcomes, intervals, paired tiles, repeatability, the baseline's law."""
+"""The protocol: outcomes, intervals, paired tiles, repeatability, the script's table."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from test_drivers import save_high
 
+import evaluate
 from tdgc import evaluation
-from tdgc.commands import INDEX, default_command
+from tdgc.drivers import BaselineDriver, HierarchyDriver, load_high
 from tdgc.evaluation import (
     BATCH,
     CONDITIONS,
     OUTCOMES,
     Cell,
     Episode,
-    GaitPolicyDriver,
-    GoToGoal,
     classify,
     low_config,
     physics_of,
@@ -25,17 +28,43 @@ from tdgc.evaluation import (
     push_velocities,
     run_cell,
     summarise,
+    tile_of,
     wilson_interval,
 )
-from tdgc.high_env import PRETRAINED
+from tdgc.gaits import GAIT_TABLE, GAITS
+from tdgc.high_env import PRETRAINED, load_low
 from tdgc.locomotion import Locomotion
-from tdgc.policies import load
+from tdgc.robot import Array
 from tdgc.terrain import EVAL_STREAM, TileField, make_tile, tile_rng
 
 
 @pytest.fixture(scope="module")
 def low():
-    return load(PRETRAINED / "low")
+    return load_low(PRETRAINED / "low")[0]
+
+
+@pytest.fixture(scope="module")
+def high(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_high(tmp_path_factory.mktemp("policy") / "high", load_low(PRETRAINED / "low"))
+
+
+@pytest.fixture(scope="module")
+def table(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of the script with the default policies, on two processes."""
+    out = tmp_path_factory.mktemp("table")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "SHIPPED_HIGH", high)
+        assert evaluate.main([*SMALL, "--workers", "2", "--out", str(out)]) == 0
+    return out
+
+
+#: Robots fall into the first trench within seconds.
+SMALL = ["--levels", "10", "--families", "gap", "--episodes", "2", "--seed", "3"]
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "episodes.csv", newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def test_wilson_interval_is_the_textbook_one():
@@ -45,17 +74,6 @@ def test_wilson_interval_is_the_textbook_one():
     assert wilson_interval(0, 20)[0] == 0.0 and wilson_interval(20, 20)[1] == 1.0
     with pytest.raises(ValueError, match=r"0 <= reached <= n"):
         wilson_interval(3, 2)
-
-
-def test_go_to_goal_turns_to_the_goal_and_slows_while_it_faces_away():
-    law = GoToGoal(top_speed=0.8, distance_gain=1.0, heading_gain=1.5)
-    position = np.zeros((4, 2))
-    goal = np.array([[5.0, 0.0], [0.0, 5.0], [-5.0, 1e-9], [0.3, 0.0]])
-    speed, turn = law.law(position, np.zeros(4), goal)
-    assert speed == pytest.approx([0.8, 0.0, 0.0, 0.3], abs=1e-9)
-    assert turn == pytest.approx([0.0, 1.0, 1.0, 0.0], abs=1e-9)  # 1.5 * pi/2 is above the bound
-    _, right = law.law(np.zeros((1, 2)), np.array([0.4]), np.array([[5.0, 0.0]]))
-    assert right == pytest.approx([-0.6])
 
 
 def test_plan_has_every_cell_once_and_fewer_episodes_off_nominal():
@@ -130,38 +148,78 @@ def test_outcomes_are_told_apart(low):
         loco.world.close()
 
 
-def test_the_same_seed_gives_the_same_episodes(low):
-    cell = Cell("gp", "nominal", "rough", 0, 3, 2)
-    first = run_cell(cell, low, GaitPolicyDriver(), seed=5)
-    second = run_cell(cell, low, GaitPolicyDriver(), seed=5)
-    assert [dataclasses.astuple(e) for e in first] == [dataclasses.astuple(e) for e in second]
-    other = run_cell(cell, low, GaitPolicyDriver(), seed=6)
-    assert [e.path_m for e in other] != [e.path_m for e in first]
-    for e in first:
-        assert e.family == "rough" and e.level == 0 and e.outcome in OUTCOMES
-        assert 0.0 < e.time_s <= 20.0 and sum(e.shares) == pytest.approx(1.0)
-        assert e.shares[0] == 1.0  # gp trots
+class Watcher(BaselineDriver):
+    """A baseline that notes what it was given."""
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        super().begin(loco, goal, family)
+        assert loco.world.field is not None
+        start = loco.world.state
+        poses = [start.position, start.quaternion, start.q]
+        self.given = [loco.world.field.heights.copy(), goal.copy(), *(x.copy() for x in poses)]
 
 
-def test_baseline_holds_the_default_behaviour_parameters(low):
-    config = low_config(low)
-    loco = Locomotion(1, config.robot, config.physics, None)
-    try:
-        driver = GaitPolicyDriver()
-        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
-        driver.begin(loco, np.array([[6.5, 0.0]]))
-        command = driver.command(0)[0]
-        expected = default_command()
-        expected[INDEX["vx"]] = driver.law.top_speed
-        expected[INDEX["swing_height"]] = driver.law.swing_height
-        assert command == pytest.approx(expected)
-    finally:
-        loco.world.close()
+def test_every_policy_gets_the_same_tiles_starts_and_goals(low, monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 0.02)
+    given = []
+    for policy, seed in (("gp", 5), ("tdgc", 5), ("tdgc", 6)):
+        driver = Watcher()
+        run_cell(Cell(policy, "nominal", "rough", 8, 3, 2), low, driver, seed)
+        given.append(driver.given)
+    for mine, same, other in zip(*given, strict=True):
+        assert np.array_equal(mine, same)
+        assert other is given[2][-1] or not np.array_equal(mine, other)  # joints start alike
+    tile = tile_of(5, "rough", 8, 4)
+    assert np.array_equal(given[0][0][161:], tile.heights)
+    assert given[0][1][1] == pytest.approx(tile.goal + [8.05, 0.0])
+
+
+def test_an_episode_alone_and_twice(low, monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 1.0)
+    cell = Cell("gp", "nominal", "rough", 6, 3, 2)
+    first, second = (run_cell(cell, low, BaselineDriver(), seed=5) for _ in range(2))
+    for k, (a, b) in enumerate(zip(first, second, strict=True)):
+        assert a.row() == b.row() and np.array_equal(a.track, b.track)
+        assert a.outcome == "timeout" and a.time_s == pytest.approx(1.0)
+        tile = tile_of(5, "rough", 6, 3 + k)
+        assert a.track.shape == (6, 3)  # at 0, 0.2, ..., 0.8 s and at the end
+        assert a.track[0] == pytest.approx(tile.start, abs=1e-6)
+        assert a.goal == pytest.approx(tile.goal)
+        direct = np.linalg.norm(np.diff(a.track[:, :2], axis=0), axis=1).sum()
+        assert 0.1 < direct <= a.path_m + 1e-9  # its way is longer than its chords
+
+
+class Recorder(HierarchyDriver):
+    """A hierarchy that notes what it commanded."""
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        super().begin(loco, goal, family)
+        self.said: list[Array] = []
+
+    def command(self, step: int) -> Array:
+        self.said.append(super().command(step))
+        return self.said[-1]
+
+
+def test_shares_are_of_the_gaits_commanded(low, high, monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 1.0)
+    driver = Recorder(*load_high(high, low, low_config(low)))
+    episodes = run_cell(Cell("tdgc", "nominal", "rough", 0, 0, 2), low, driver, seed=0)
+    assert np.count_nonzero(episodes[0].shares) > 2
+    for k, episode in enumerate(episodes):
+        said = np.array(driver.said)[: round(episode.time_s / 0.02), k, 12:]
+        for embedding, share in zip(GAIT_TABLE, episode.shares, strict=True):
+            assert share == pytest.approx(np.mean((said == embedding).all(axis=1)))
+        assert sum(episode.shares) == pytest.approx(1.0)
 
 
 def test_summary_counts_and_averages():
     def row(family: str, level: int, outcome: str) -> Episode:
-        return Episode("gp", "nominal", family, level, 0, 0, outcome, 1.0, 1.0)
+        nothing = np.zeros((1, 3))
+        shares = (1.0, 0.0, 0.0, 0.0)
+        return Episode(
+            "gp", "nominal", family, level, 0, 0, outcome, 1.0, 1.0, shares, nothing[0, :2], nothing
+        )
 
     rows = [
         row("rough", 6, "reached"), row("rough", 6, "fell"),
@@ -182,3 +240,79 @@ def test_tracking_measures_against_the_command(low):
     # A policy that stood still would be off by the commands' own spread, sqrt((1 + 0.36) / 3).
     assert 0.0 < result["velocity_rmse"] < math.sqrt((1.0 + 0.36) / 3.0)
     assert 0.5 < result["contact_match"] <= 1.0
+
+
+# ------------------------------------------------------------------ the script
+
+
+def test_results_have_a_row_and_a_track_an_episode(table):
+    rows = rows_of(table)
+    assert list(rows[0]) == [
+        "policy", "condition", "family", "level", "episode", "seed", "outcome", "time_s", "path_m",
+        *(f"share_{gait}" for gait in GAITS),
+    ]  # fmt: skip
+    assert [(r["policy"], r["episode"]) for r in rows] == [
+        ("tdgc", "0"), ("tdgc", "1"), ("gp", "0"), ("gp", "1"),
+    ]  # fmt: skip
+    assert all(r["outcome"] in OUTCOMES and 0.0 < float(r["time_s"]) <= 20.0 for r in rows)
+    assert all(float(r["share_trot"]) == 1.0 for r in rows[2:])
+    with np.load(table / "trajectories.npz") as data:
+        assert data["counts"].sum() == len(data["poses"])
+        times = np.array([float(r["time_s"]) for r in rows])
+        assert data["counts"].tolist() == (np.ceil(times / 0.2 - 1e-6) + 1).tolist()
+        starts = data["poses"][np.cumsum(data["counts"]) - data["counts"]]
+        assert np.array_equal(starts[:2], starts[2:])  # paired
+        assert np.array_equal(data["goals"][:2], data["goals"][2:])
+    summary = json.loads((table / "summary.json").read_text(encoding="utf-8"))
+    assert list(summary) == ["tdgc", "gp"] and summary["gp"]["nominal"]["gap"]["10"]["n"] == 2
+    figures = {path.name for path in table.glob("*.png")}
+    assert figures == {"success.png", "gaits.png", "headings.png", "trajectories.png"}
+
+
+def test_the_table_does_not_depend_on_the_processes(table, low, high, tmp_path):
+    """Two cells on two processes, both on one, and one of them here, where others ran before."""
+    flags = ["--policies", "tdgc,gp", "--high", str(high), "--workers", "1"]
+    assert evaluate.main([*SMALL, *flags, "--out", str(tmp_path)]) == 0
+    for name in ("episodes.csv", "summary.json"):
+        assert (tmp_path / name).read_bytes() == (table / name).read_bytes()
+    with np.load(table / "trajectories.npz") as one, np.load(tmp_path / "trajectories.npz") as two:
+        assert all(np.array_equal(one[key], two[key]) for key in ("poses", "counts", "goals"))
+    driver = HierarchyDriver(*load_high(high, low, low_config(low)))
+    here = run_cell(Cell("tdgc", "nominal", "gap", 10, 0, 2), low, driver, seed=3)
+    assert [{k: str(v) for k, v in e.row().items()} for e in here] == rows_of(table)[:2]
+
+
+def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "SHIPPED_HIGH", tmp_path / "none")
+    flags = ["--levels", "10", "--families", "gap", "--episodes", "1", "--workers", "1"]
+    assert evaluate.main([*flags, "--out", str(tmp_path / "out")]) == 0
+    assert {row["policy"] for row in rows_of(tmp_path / "out")} == {"gp"}
+    capsys.readouterr()
+    assert evaluate.main(["--policies", "tdgc"]) == 2
+    message = "no high level is shipped; give one with --high, or use --policies gp"
+    assert capsys.readouterr().err == f"evaluate.py: {message}\n"
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--policies", "wtw"], "unknown policy 'wtw'; allowed: all, tdgc, gp"),
+        (["--families", "gap,gap"], "family 'gap' is named twice"),
+        (["--levels", "6-8,7"], "--levels '6-8,7' names a level twice"),
+        (["--levels", "13"], "--levels '13' must name levels from 0 to 12"),
+        (["--levels", "high"], "cannot read --levels 'high'; write e.g. 6-10 or 0,5,10"),
+        (["--workers", "0"], "--workers must be at least 1, not 0"),
+        (["--seed", "-1"], "--seed must lie in [0, 2**32), not -1"),
+        (["--high", "nowhere/high"], "nowhere/high.json: no such file"),
+    ],
+)
+def test_flags_that_cannot_be_used(flags, message, capsys):
+    assert evaluate.main(flags) == 2
+    assert capsys.readouterr().err == f"evaluate.py: {message}\n"
+
+
+def test_a_policy_of_the_wrong_kind(high, capsys):
+    assert evaluate.main(["--low", str(high)]) == 2
+    assert capsys.readouterr().err.endswith("high: not a low-level policy of this package\n")
+    assert evaluate.main(["--high", str(PRETRAINED / "low")]) == 2
+    assert capsys.readouterr().err.endswith("low: not a high-level policy of this package\n")

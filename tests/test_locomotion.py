@@ -370,3 +370,14 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
     dynamics = critic[where["dynamics"]].tolist()
     assert dynamics == pytest.approx([0.6, 0.5, 0.0, 0.4])
     task.close()
+
+
+def test_phases_follow_the_clock_of_a_placed_robot() -> None:
+    """Before any step: what the high level sees first is this episode's clock."""
+    loco = Locomotion(2, RobotConfig(), PhysicsConfig(), None)
+    loco.place(np.arange(2), np.array([[0.0, 0.0], [5.0, 0.0]]), np.zeros(2), np.array([0.1, 0.35]))
+    # Trot with a duty factor of one half: FL and RR half a cycle ahead of FR and RL.
+    np.testing.assert_allclose(
+        loco.clock.phases, [[0.6, 0.1, 0.1, 0.6], [0.85, 0.35, 0.35, 0.85]], atol=1e-12
+    )
+    loco.world.close()

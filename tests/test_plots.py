@@ -1,30 +1,131 @@
-"""Figures come out of files, also at the ends of the scale."""
+"""Figures come out of files, also at the ends of the scale; headings are told from the travel."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
+import pytest
 
 from tdgc import plots
-from tdgc.evaluation import Episode, summarise
+from tdgc.evaluation import Episode, tile_of, write_results
+from tdgc.robot import Array
+
+FAMILIES = ("rough", "gap")
+
+
+def straight(start: Array, way: Array, heading: float, seconds: float) -> Array:
+    """(n, 3) poses every 0.2 s at constant velocity ``way`` (2,) m/s, the nose at ``heading``."""
+    times = np.append(np.arange(0.0, seconds, 0.2), seconds)
+    return np.column_stack([start[:2] + times[:, None] * way, np.full(len(times), heading)])
+
+
+def write(folder: Path, conditions: Sequence[str] = ("nominal",), heading: float = 0.0) -> Path:
+    """Results of ten robots a cell: ``tdgc``'s all arrive, ``gp``'s all fall; a gait a family."""
+    episodes = []
+    for condition in conditions:
+        for policy, outcome in (("tdgc", "reached"), ("gp", "fell")):
+            for g, family in enumerate(FAMILIES):
+                for level in (6, 7):
+                    for k in range(10):
+                        tile = tile_of(0, family, level, k)
+                        way = (tile.goal - tile.start[:2]) / 10.0
+                        shares = np.eye(4)[g if policy == "tdgc" else 0]
+                        episodes.append(
+                            Episode(
+                                policy, condition, family, level, k, 0, outcome, 9.5, 6.0,
+                                tuple(shares), tile.goal, straight(tile.start, way, heading, 9.5),
+                            )
+                        )  # fmt: skip
+    write_results(folder, episodes)
+    return folder
+
+
+def picture(path: Path) -> Array:
+    """(height, width, 3), and not blank."""
+    pixels = matplotlib.image.imread(path)[..., :3]
+    assert pixels.shape[0] > 200 and np.ptp(pixels) == 1.0
+    return pixels
+
+
+def share_of(pixels: Array, colour: str) -> float:
+    """Of all pixels, those of nearly that colour."""
+    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+    return float((np.abs(pixels - wanted) < 0.02).all(axis=-1).mean())
 
 
 def test_success_figure_with_rates_of_none_and_all(tmp_path: Path) -> None:
-    rows = [
-        Episode(policy, "nominal", family, level, k, 0, outcome, 1.0, 1.0)
-        for policy, outcome in (("gp", "fell"), ("tdgc", "reached"))
-        for family in ("rough", "gap")
-        for level in (6, 7)
-        for k in range(10)
-    ]
-    (tmp_path / "summary.json").write_text(json.dumps(summarise(rows)), encoding="utf-8")
-    plots.success_by_level(tmp_path / "summary.json", tmp_path / "success.png")
-    picture = matplotlib.image.imread(tmp_path / "success.png")
-    assert picture.shape[0] > 200 and picture.shape[1] > picture.shape[0]
-    assert np.ptp(picture[..., :3]) == 1.0  # something was drawn on white
+    write(tmp_path)
+    plots.success_by_level(tmp_path / "summary.json", tmp_path / "one.png")
+    one = picture(tmp_path / "one.png")
+    assert one.shape[1] > one.shape[0]
+    write(tmp_path, ["nominal", "mixed", "pushes"])
+    plots.success_by_level(tmp_path / "summary.json", tmp_path / "three.png")
+    three = picture(tmp_path / "three.png")
+    assert three.shape[0] > 2.5 * one.shape[0] - 200  # a row of panels a condition
+
+
+def test_gait_figure_is_half_and_half(tmp_path: Path) -> None:
+    """tdgc: one family all trot, the other all pronk; gp: all trot."""
+    plots.gait_shares(write(tmp_path), tmp_path / "gaits.png")
+    pixels = picture(tmp_path / "gaits.png")
+    trot, pronk, pace, bound = (share_of(pixels, c) for c in plots._GAIT_COLOURS)
+    # Three bars against one; the legend, which alone has the others, has as much of each.
+    assert (trot - pace) / (pronk - pace) == pytest.approx(3.0, abs=0.1)
+    assert 0.0 < bound < 0.1 * pronk
+
+
+def test_heading_to_travel() -> None:
+    north = np.array([0.0, 0.5])
+    for nose, expected in ((np.pi / 2, 0.0), (0.0, -np.pi / 2), (np.pi, np.pi / 2)):
+        angles = plots.heading_to_travel(straight(np.zeros(2), north, nose, 2.05))
+        assert angles == pytest.approx(np.full(10, expected))  # the last, short step is left out
+    backwards = plots.heading_to_travel(straight(np.zeros(2), north, -np.pi / 2, 1.0))
+    assert np.abs(backwards) == pytest.approx(np.full(4, np.pi))
+    assert plots.heading_to_travel(straight(np.zeros(2), 0.19 * north, 0.0, 2.0)).size == 0
+    # Turning left along a circle with the nose ahead, across the cut at pi.
+    angle = np.linspace(0.0, 2.0, 21)
+    circle = np.column_stack([np.cos(angle), np.sin(angle), angle + np.pi / 2])
+    circle[:, 2] = np.mod(circle[:, 2] + np.pi, 2 * np.pi) - np.pi
+    assert plots.heading_to_travel(circle) == pytest.approx(np.zeros(19), abs=1e-9)
+
+
+def test_heading_figure_turns_with_the_robots(tmp_path: Path) -> None:
+    """Robots that walk ahead fill what lies above the centres, backwards what lies below."""
+    centroids = []
+    for name, heading in (("ahead", 0.0), ("back", np.pi)):
+        (tmp_path / name).mkdir()
+        write(tmp_path / name, heading=heading)
+        plots.headings(tmp_path / name, tmp_path / "headings.png")
+        pixels = picture(tmp_path / "headings.png")
+        rows = np.flatnonzero((pixels[..., 2] - pixels[..., 0] > 0.3).any(axis=1))  # tdgc's blue
+        centroids.append(rows.mean() / len(pixels))
+    assert centroids[1] - centroids[0] > 0.1
+
+
+def test_heading_figure_of_robots_that_stand(tmp_path: Path) -> None:
+    tile = tile_of(0, "gap", 6, 0)
+    track = straight(tile.start, np.zeros(2), 0.0, 1.0)
+    still = Episode(
+        "gp", "nominal", "gap", 6, 0, 0, "timeout", 1.0, 0.0, (1.0, 0.0, 0.0, 0.0), tile.goal, track
+    )
+    write_results(tmp_path, [still])
+    plots.headings(tmp_path, tmp_path / "headings.png")
+    picture(tmp_path / "headings.png")
+
+
+def test_trajectory_figure_has_a_row_a_family_on_its_hardest_level(tmp_path: Path) -> None:
+    plots.trajectories(write(tmp_path), tmp_path / "trajectories.png")
+    pixels = picture(tmp_path / "trajectories.png")
+    assert pixels.shape[1] > 2 * pixels.shape[0]  # two rows of three tiles each for two policies
+    width = pixels.shape[1]
+    left, right = pixels[:, : int(0.45 * width)], pixels[:, int(0.52 * width) :]
+    blue, orange = plots._COLOURS["tdgc"], plots._COLOURS["gp"]
+    assert share_of(left, blue) > 0.002 > 0.0 == share_of(left, orange)
+    assert share_of(right, orange) > 0.002 > 0.0 == share_of(right, blue)
 
 
 def test_training_figure_skips_what_a_phase_does_not_log(tmp_path: Path) -> None:

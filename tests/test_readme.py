@@ -37,8 +37,8 @@ COMMANDS: dict[str, str | None] = {
         "--low {tmp}/low/policy --steps 16 --n-envs 4 --workers 1 --set ppo.n_steps=2 "
         "--set ppo.minibatches=1 --out {tmp}/high"
     ),
-    "python evaluate.py --low runs/low/policy --levels 6-10": (
-        "--low {tmp}/low/policy --levels 6 --families tilt --episodes 1 --workers 1 "
+    "python evaluate.py --low runs/low/policy --policies gp --levels 6-10": (
+        "--low {tmp}/low/policy --policies gp --levels 6 --families tilt --episodes 1 --workers 1 "
         "--out {tmp}/evaluation"
     ),
     "python evaluate.py --tracking": "--episodes 1 --workers 1 --out {tmp}/tracking",

@@ -1,25 +1,18 @@
-"""The fast recurrent policy against sb3-contrib's own: same outputs, gradients and training."""
+"""The fast recurrent learner against sb3-contrib's own: same outputs, gradients and training."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from sb3_contrib import RecurrentPPO
-from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
-from tdgc.recurrent import FastRecurrentPolicy
+from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO, _Recurrence
 
 OBS, ACT, HIDDEN = 6, 2, 16
-VARIANTS = [
-    {},
-    {"n_lstm_layers": 2},
-    {"enable_critic_lstm": False},
-    {"enable_critic_lstm": False, "shared_lstm": True},
-]
+ENVS, STEPS = 5, 12
 
 
 @pytest.fixture(autouse=True)
@@ -53,27 +46,19 @@ class MemoryEnv(gym.Env):
         return self.obs, reward, bool(ended), bool(limit), {}
 
 
-def make_model(policy: type[RecurrentActorCriticPolicy], **kwargs) -> RecurrentPPO:
-    """12 steps of 5 environments; minibatches of 17 cut sequences at odd places."""
-    env = DummyVecEnv([lambda i=i: MemoryEnv(i) for i in range(5)])
-    return RecurrentPPO(
+def make_model(policy, batch_size: int = 24, **kwargs) -> FastRecurrentPPO:
+    """Two minibatches, of three environments and of two, unless told."""
+    env = DummyVecEnv([lambda i=i: MemoryEnv(i) for i in range(ENVS)])
+    policy_kwargs = {"lstm_hidden_size": HIDDEN, "net_arch": [8]} | kwargs.pop("policy_kwargs", {})
+    defaults = {"n_epochs": 3, "learning_rate": 3e-3, "seed": 3, "device": "cpu"}
+    return FastRecurrentPPO(
         policy,
         env,
-        n_steps=12,
-        batch_size=17,
-        n_epochs=3,
-        learning_rate=3e-3,
-        seed=3,
-        device="cpu",
-        policy_kwargs={"lstm_hidden_size": HIDDEN, "net_arch": [8], **kwargs},
+        n_steps=STEPS,
+        batch_size=batch_size,
+        policy_kwargs=policy_kwargs,
+        **{**defaults, **kwargs},
     )
-
-
-def count_calls(lstm: nn.LSTM) -> list[int]:
-    """A list that gets the sequence length of every call of ``lstm``."""
-    lengths: list[int] = []
-    lstm.register_forward_hook(lambda module, inputs, output: lengths.append(len(inputs[0])))
-    return lengths
 
 
 def gradients(policy: nn.Module) -> dict[str, th.Tensor]:
@@ -87,105 +72,154 @@ def assert_close(got: dict[str, th.Tensor], want: dict[str, th.Tensor], toleranc
         assert error <= tolerance * (1.0 + want[name].abs().max()), name
 
 
-def test_it_is_the_stock_policy_but_for_the_pass():
+def test_parameters_are_the_stock_policys():
     fast, stock = make_model(FastRecurrentPolicy).policy, make_model("MlpLstmPolicy").policy
     assert fast.state_dict().keys() == stock.state_dict().keys()
     assert all(th.equal(a, stock.state_dict()[n]) for n, a in fast.state_dict().items())
+    groups = [p.optimizer.param_groups[0] for p in (fast, stock)]
+    assert groups[0]["eps"] == groups[1]["eps"] and groups[0]["lr"] == groups[1]["lr"]
 
 
-@pytest.mark.parametrize("layers", [1, 2])
-def test_pass_equals_the_loop_where_sequences_start_episodes(layers):
+def test_backward_is_the_derivative_of_forward():
+    """Against finite differences in double precision, with starts in the first step and later."""
     generator = th.Generator().manual_seed(0)
-    n_seq, length = 9, 7
-    lstm = nn.LSTM(OBS, HIDDEN, num_layers=layers)
-    features = th.randn(n_seq * length, OBS, generator=generator)
-    states = tuple(th.randn(layers, n_seq, HIDDEN, generator=generator) for _ in range(2))
-    starts = th.zeros(n_seq, length)
-    starts[[1, 2, 6], 0] = 1.0
-    weights = th.randn(n_seq * length, HIDDEN, generator=generator)
-    results = []
-    for policy in (FastRecurrentPolicy, RecurrentActorCriticPolicy):
-        inputs = [t.clone().requires_grad_() for t in (features, *states)]
-        lstm.zero_grad()
-        output, last = policy._process_sequence(
-            inputs[0], (inputs[1], inputs[2]), starts.flatten(), lstm
-        )
-        ((output * weights).sum() + last[0].sum() - last[1].sum()).backward()
-        tensors = {"output": output, "h": last[0], "c": last[1], **gradients(lstm)}
-        results.append(tensors | {f"input{i}": t.grad for i, t in enumerate(inputs)})
-    assert_close(results[0], results[1], 2e-6)
-    # The gradient does not flow into a state that was zeroed, and does into the others.
-    for grad in (results[0]["input1"], results[0]["input2"]):
-        assert grad[:, [1, 2, 6]].abs().max() == 0.0
-        assert grad[:, [0, 3, 4, 5, 7, 8]].abs().amax((0, 2)).min() > 1e-4
+
+    def normal(*shape: int) -> th.Tensor:
+        return th.randn(*shape, generator=generator, dtype=th.float64)
+
+    n, length, n_seq, hidden = 2, 4, 3, 2
+    keep = th.ones(length, n_seq, 1, dtype=th.float64)
+    keep[0, 0] = keep[2, 1] = keep[3, 1] = 0.0
+    x, u = normal(n, length, n_seq, 4 * hidden), normal(n, 4 * hidden, hidden)
+    h, c = normal(n, n_seq, hidden), normal(n, n_seq, hidden)
+    inputs = (x.requires_grad_(), keep, h, c, u.requires_grad_())
+    assert th.autograd.gradcheck(_Recurrence.apply, inputs)
 
 
-def test_a_start_inside_a_sequence_is_still_right():
-    generator = th.Generator().manual_seed(1)
-    lstm = nn.LSTM(OBS, HIDDEN)
-    features = th.randn(3 * 5, OBS, generator=generator)
-    states = (th.randn(1, 3, HIDDEN, generator=generator),) * 2
-    starts = th.zeros(3, 5)
-    starts[0, 0] = starts[1, 3] = 1.0
-    output, last = FastRecurrentPolicy._process_sequence(features, states, starts.flatten(), lstm)
-    output = output.view(3, 5, HIDDEN)
-    # By hand: from its start on, sequence 1 is a sequence of its own from a state of zeros.
-    alone, (h, c) = lstm(features.view(3, 5, OBS)[1, 3:])
-    assert (output[1, 3:] - alone).abs().max() < 1e-6
-    assert max((last[0][:, 1] - h).abs().max(), (last[1][:, 1] - c).abs().max()) < 1e-6
-    fresh, _ = lstm(features.view(3, 5, OBS)[0])
-    assert (output[0] - fresh).abs().max() < 1e-6
-
-
-@pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: "-".join(v) or "default")
-def test_evaluate_actions_on_real_rollouts(variant):
-    stock = make_model("MlpLstmPolicy", **variant)
-    fast = make_model(FastRecurrentPolicy, **variant).policy
-    stock.learn(60)
-    fast.load_state_dict(stock.policy.state_dict())
-    fast_calls, stock_calls = count_calls(fast.lstm_actor), count_calls(stock.policy.lstm_actor)
-    padded = inside = 0
-    for batch in stock.rollout_buffer.get(17):
-        inside += int((batch.episode_starts > 0).sum())
-        padded += int((batch.mask < 0.5).sum())
-        outputs = []
-        for policy in (fast, stock.policy):
+def test_outputs_and_gradients_on_rollouts():
+    """Every minibatch of a real rollout, episodes starting anywhere, against the stock pass."""
+    model, stock = make_model(FastRecurrentPolicy), make_model("MlpLstmPolicy").policy
+    model.learn(3 * ENVS * STEPS)
+    stock.load_state_dict(model.policy.state_dict())
+    starts = th.zeros(STEPS)
+    for batch in model.rollout_buffer.get(24):
+        assert batch.lstm_states.pi[0].abs().max() > 0.01  # the rollout goes on from another
+        results = []
+        for policy in (model.policy, stock):
             policy.zero_grad()
             values, log_prob, entropy = policy.evaluate_actions(
                 batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
             )
-            mask = batch.mask > 0.5
-            (values.flatten() * batch.returns + log_prob * batch.advantages)[mask].sum().backward()
+            (values.flatten() * batch.returns + log_prob * batch.advantages).sum().backward()
             tensors = {"values": values, "log_prob": log_prob, "entropy": entropy}
-            outputs.append(tensors | gradients(policy))
-        assert_close(outputs[0], outputs[1], 5e-6)
-    assert inside >= 3 and padded >= 5  # the rollout did hold what makes this hard
-    assert len(fast_calls) == 4 and max(fast_calls) > 3  # one call a minibatch
-    assert len(stock_calls) > 12 and max(stock_calls) == 1  # a call a step
+            results.append(tensors | gradients(policy))
+        assert_close(results[0], results[1], 5e-6)
+        starts += batch.episode_starts.view(-1, STEPS).sum(0)
+    assert starts[0] >= 1 and (starts[1:] > 0).sum() >= 4
 
 
-@pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: "-".join(v) or "default")
-def test_training_ends_at_the_same_weights(variant):
+def test_an_episode_starts_from_nothing():
+    """By hand, without the stock pass: from its start on, an episode is a sequence of its own."""
+    policy = make_model(FastRecurrentPolicy).policy
+    generator = th.Generator().manual_seed(1)
+    obs = th.randn(3, 5, OBS, generator=generator)
+    actions = th.randn(3, 5, ACT, generator=generator)
+    before = [th.randn(1, 3, HIDDEN, generator=generator) for _ in range(4)]
+    starts = th.zeros(3, 5)
+    starts[0, 0] = starts[1, 3] = 1.0
+
+    def evaluate(rows: slice, steps: slice, states: list[th.Tensor], starts: th.Tensor):
+        with th.no_grad():
+            values, log_prob, _ = policy.evaluate_actions(
+                obs[rows, steps].flatten(0, 1), actions[rows, steps].flatten(0, 1),
+                RNNStates((states[0], states[1]), (states[2], states[3])),
+                starts[rows, steps].flatten(),
+            )  # fmt: skip
+        return th.stack((values.flatten(), log_prob)).view(2, starts[rows].shape[0], -1)
+
+    whole = evaluate(slice(3), slice(5), before, starts)
+    zeros = [th.zeros(1, 1, HIDDEN)] * 4
+    for row, first in ((0, 0), (1, 3)):
+        alone = evaluate(slice(row, row + 1), slice(first, 5), zeros, th.zeros(3, 5))
+        assert (whole[:, row, first:] - alone[:, 0]).abs().max() < 1e-6
+    # Without a start the states matter to the end.
+    without = evaluate(slice(2, 3), slice(5), zeros, starts)
+    assert (whole[:, 2] - without[:, 0]).abs().amax(0).min() > 1e-3
+
+
+def test_rollouts_are_evaluated_as_they_were_collected():
+    """Before a parameter changes, the update sees the values and probabilities of collecting."""
+    model = make_model(FastRecurrentPolicy, learning_rate=0.0)
+    model.learn(2 * ENVS * STEPS)
+    for batch in model.rollout_buffer.get(24):
+        values, log_prob, _ = model.policy.evaluate_actions(
+            batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
+        )
+        assert (values.flatten() - batch.old_values).abs().max() < 2e-6
+        assert (log_prob - batch.old_log_prob).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("batch_size", "sizes"), [(60, [5]), (30, [3, 2]), (24, [3, 2]), (12, [1] * 5), (None, [5])]
+)
+def test_minibatches_are_whole_environments(batch_size, sizes):
+    model = make_model("MlpLstmPolicy")
+    model.learn(ENVS * STEPS)
+    buffer = model.rollout_buffer
+    whole = buffer.observations.swapaxes(0, 1)
+    seen = []
+    for batch, size in zip(buffer.get(batch_size), sizes, strict=True):
+        assert batch.mask.shape == (size * STEPS,) and bool((batch.mask == 1.0).all())
+        for k, rollout in enumerate(batch.observations.view(size, STEPS, OBS).numpy()):
+            (env,) = np.flatnonzero((whole == rollout).all((1, 2)))
+            seen.append(env)
+            rows = slice(k * STEPS, (k + 1) * STEPS)
+            assert np.array_equal(batch.returns[rows], buffer.returns[:, env])
+            assert np.array_equal(batch.episode_starts[rows], buffer.episode_starts[:, env])
+            assert np.array_equal(batch.actions[rows], buffer.actions[:, env])
+            assert np.array_equal(batch.lstm_states.vf[1][:, k], buffer.cell_states_vf[0][:, env])
+    assert sorted(seen) == list(range(ENVS))
+
+
+def test_order_of_environments_is_drawn_from_numpys_generator():
+    buffer = make_model("MlpLstmPolicy").rollout_buffer
+
+    def order(seed: int) -> list[int]:
+        np.random.seed(seed)
+        return [int(b.observations[0, 0]) for _ in range(4) for b in buffer.get(STEPS)]
+
+    buffer.observations[:] = np.arange(ENVS)[:, None]
+    assert order(0) == order(0) != order(1)
+    assert order(0)[:ENVS] != order(0)[ENVS : 2 * ENVS]
+
+
+def test_training_ends_at_the_same_weights():
     trained = []
-    for policy in (FastRecurrentPolicy, RecurrentActorCriticPolicy):
-        model = make_model(policy, **variant)  # which seeds torch and numpy, so not before the loop
+    for policy in (FastRecurrentPolicy, "MlpLstmPolicy"):
+        model = make_model(policy)  # which seeds torch and numpy, so not before the loop
         start = {name: t.clone() for name, t in model.policy.state_dict().items()}
-        trained.append(dict(model.learn(3 * 60).policy.state_dict()))
+        trained.append(dict(model.learn(3 * ENVS * STEPS).policy.state_dict()))
     fast, stock = trained
     assert_close(fast, stock, 1e-4)
     assert min((fast[name] - start[name]).abs().max() for name in start) > 1e-3  # it did train
 
 
-def test_one_step_with_many_environments():
-    """Collecting: a sequence per environment, one step long, some of them starting."""
-    stock, fast = make_model("MlpLstmPolicy").policy, make_model(FastRecurrentPolicy).policy
-    generator = th.Generator().manual_seed(2)
-    obs = th.randn(100, OBS, generator=generator)
-    parts = [th.randn(1, 100, HIDDEN, generator=generator) for _ in range(4)]
-    states = RNNStates((parts[0], parts[1]), (parts[2], parts[3]))
-    starts = (th.rand(100, generator=generator) < 0.3).float()
-    with th.no_grad():
-        got, want = (p(obs, states, starts, deterministic=True) for p in (fast, stock))
-    flat = [dict(enumerate([*r[:3], *r[3].pi, *r[3].vf])) for r in (got, want)]
-    assert_close(flat[0], flat[1], 1e-6)
-    assert 0 < starts.sum() < 100
+@pytest.mark.parametrize(
+    "variant",
+    [
+        {"n_lstm_layers": 2},
+        {"lstm_kwargs": {"bias": False}},
+        {"enable_critic_lstm": False},
+        {"enable_critic_lstm": False, "shared_lstm": True},
+        {"share_features_extractor": False},
+    ],
+    ids=lambda v: "-".join(v),
+)
+def test_other_lstms_are_refused(variant):
+    with pytest.raises(ValueError, match=r"^FastRecurrentPolicy has plain LSTMs of one layer, one"):
+        make_model(FastRecurrentPolicy, policy_kwargs=variant)
+
+
+def test_a_minibatch_below_one_rollout_is_refused():
+    with pytest.raises(ValueError, match=r"^a minibatch of 11 steps does not hold the 12 of one"):
+        make_model(FastRecurrentPolicy, batch_size=11)

@@ -1,12 +1,18 @@
 """Checkpoints, interruption, and a resumed run that ends as if it had never stopped."""
 
+import contextlib
 import dataclasses
 import json
+import multiprocessing
 import os
 import random
+import resource
 import shutil
 import signal
-from collections.abc import Iterator
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +21,7 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO
 
+import train_high
 import train_low
 from tdgc import policies
 from tdgc.config import LowTrainConfig, PPOConfig, from_dict, with_overrides
@@ -23,11 +30,16 @@ from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.training import (
     CheckpointError,
     Interruption,
+    append_line,
     load_learner,
     newest_checkpoint,
     read_checkpoint,
     save_checkpoint,
+    snapshot,
 )
+from tdgc.vec import worker_seed
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(autouse=True)
@@ -66,7 +78,7 @@ def draw() -> tuple[float, float, float]:
 def test_checkpoint_round_trip(tmp_path: Path) -> None:
     model = learner(seed=1)
     np.random.normal()  # so that numpy holds back the second of a pair
-    path = save_checkpoint(tmp_path, model, {"workers": [{"epoch": 3}], "phase": 1})
+    path = save_checkpoint(tmp_path, *snapshot(model, {"workers": [{"epoch": 3}], "phase": 1}))
     assert path == tmp_path / "step-000000000032"
     saved, drawn = parameters(model), draw()
     other = learner(seed=2, steps=16)
@@ -85,7 +97,7 @@ def test_two_checkpoints_are_kept(tmp_path: Path) -> None:
     model = learner(seed=0)
     for steps in (100, 9, 2000, 2000):
         model.num_timesteps = steps
-        save_checkpoint(tmp_path, model, {})
+        save_checkpoint(tmp_path, *snapshot(model, {}))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["step-000000000100", "step-000000002000"]
 
 
@@ -95,7 +107,7 @@ def three(folder: Path) -> list[Path]:
     made = []
     for steps in (10, 20):
         model.num_timesteps = steps
-        made.append(save_checkpoint(folder / "checkpoints", model, {"at": steps}))
+        made.append(save_checkpoint(folder / "checkpoints", *snapshot(model, {"at": steps})))
     (folder / "checkpoints" / ".step-000000000030.partial").mkdir()
     return made
 
@@ -160,10 +172,47 @@ def test_no_checkpoint_at_all(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_of_another_network(tmp_path: Path) -> None:
-    tensors, header = read_checkpoint(save_checkpoint(tmp_path, learner(seed=0), {}))
+    tensors, header = snapshot(learner(seed=0), {})
     with pytest.raises(CheckpointError, match=r"^the checkpoint does not fit the conf") as caught:
         load_learner(learner(seed=0, hidden=9), tensors, header)
     assert "\n" not in str(caught.value)
+
+
+# ------------------------------------------------------------------ a full disk
+
+
+@contextlib.contextmanager
+def no_file_larger_than(size: int) -> Iterator[None]:
+    """As if the disk had that much room."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_checkpoint_that_finds_no_room_leaves_those_before(tmp_path: Path) -> None:
+    model = learner(seed=0)
+    kept = [save_checkpoint(tmp_path, *snapshot(model, {"at": 0}))]
+    model.num_timesteps += 1
+    with no_file_larger_than(2000), pytest.raises(OSError):
+        save_checkpoint(tmp_path, *snapshot(model, {"at": 1}))
+    assert list(tmp_path.iterdir()) == kept
+    assert read_checkpoint(kept[0])[1]["at"] == 0
+    kept.append(save_checkpoint(tmp_path, *snapshot(model, {"at": 2})))
+    assert sorted(tmp_path.iterdir()) == kept
+
+
+def test_a_line_is_added_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    append_line(path, "first")
+    for size in (6, 9):  # no room, and room for a part
+        with no_file_larger_than(size), pytest.raises(OSError):
+            append_line(path, "second")
+        assert path.read_text() == "first\n"
+    append_line(path, "third")
+    assert path.read_text() == "first\nthird\n"
 
 
 # ------------------------------------------------------------------ interruption
@@ -203,7 +252,7 @@ def test_the_policy_is_symmetric(tmp_path: Path) -> None:
     for _ in range(2):
         with th.no_grad():
             for tensor in policy.parameters():
-                tensor += 0.3 * th.randn_like(tensor)
+                tensor.add_(0.3 * th.randn_like(tensor))
             action = policy.get_distribution(seen).mode()
             mirrored = policy.get_distribution(image).mode()
             th.testing.assert_close(mirrored, action[:, act_index] * th.from_numpy(act_sign))
@@ -226,23 +275,40 @@ TINY = [
 ]  # fmt: skip
 
 
-def stop_at_call(monkeypatch: pytest.MonkeyPatch, last: int) -> None:
-    """Interrupt a run where it asks for the ``last`` time whether to go on."""
+def at_calls(monkeypatch: pytest.MonkeyPatch, act: Callable[[int, Interruption], None]) -> None:
+    """Call ``act(n, interruption)`` where a run asks for the n-th time whether to go on."""
     calls = 0
 
     def due(interruption: Interruption) -> bool:
         nonlocal calls
         calls += 1
-        if calls == last:
-            interruption.reason = "the test"
+        act(calls, interruption)
         return interruption.reason is not None
 
     monkeypatch.setattr(Interruption, "due", due)
 
 
+def kill_run(script: str, arguments: list[str], last: Path) -> None:
+    """Start a run and kill it as soon as the checkpoint ``last`` is there."""
+    process = subprocess.Popen(
+        [sys.executable, script, *arguments],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    while process.poll() is None and not last.exists():
+        time.sleep(0.01)
+    process.kill()
+    output, _ = process.communicate(timeout=300.0)  # which the workers hold open, too
+    assert process.returncode == -signal.SIGKILL, output.decode()
+
+
+def newest(run: Path) -> Path:
+    return max((run / "checkpoints").glob("step-*"))
+
+
 def final(run: Path) -> dict[str, Any]:
-    """What a run ended with, but for the wall time."""
-    header = json.loads((run / "checkpoints/step-000000000160/state.json").read_bytes())
+    """What a run ended with, but for the wall time: checksums of the learner's whole state and of
+    the policy, the counters, the workers' states."""
+    header = read_checkpoint(newest(run))[1]
     return {**{k: v for k, v in header.items() if k != "seconds"}, "policy": weights(run)}
 
 
@@ -250,18 +316,21 @@ def weights(run: Path) -> bytes:
     return (run / "policy.safetensors").read_bytes()
 
 
-def test_a_resumed_run_ends_as_one_that_never_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+def rows(run: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+def test_a_killed_and_resumed_run_ends_as_one_that_never_stopped(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Two updates on the plane and three on tiles, a checkpoint after each. The second run stops
-    after four, loses its newest checkpoint, and goes on from the one before."""
+    """Two updates on the plane and three on tiles, a checkpoint after each. The second run is
+    killed after three, loses its newest checkpoint, and goes on from the one before."""
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert train_low.main([*TINY, "--out", str(whole)]) == 0
     names = sorted(path.name for path in (whole / "checkpoints").iterdir())
     assert names == ["step-000000000128", "step-000000000160"]
-    rows = [json.loads(line) for line in (whole / "log.jsonl").read_text().splitlines()]
-    assert [row["steps"] for row in rows] == [64, 128]
-    assert rows[1]["reward/track_lin_vel"] > 0.0 and "level/stair" in rows[1]
+    assert [row["steps"] for row in rows(whole)] == [64, 128]
+    assert rows(whole)[1]["reward/track_lin_vel"] > 0.0 and "level/stair" in rows(whole)[1]
     stored = from_dict(LowTrainConfig, json.loads((whole / "config.json").read_text()))
     expected = LowTrainConfig(
         seed=3, n_envs=4, workers=2, steps=160, plane_steps=64, checkpoint_steps=32, log_steps=64
@@ -269,13 +338,10 @@ def test_a_resumed_run_ends_as_one_that_never_stopped(
     assert dataclasses.replace(stored, env=expected.env, ppo=expected.ppo) == expected
     assert stored.ppo.actor == (8,) and stored.env.episode_seconds == 0.4
 
-    with monkeypatch.context() as patch:
-        stop_at_call(patch, 5)  # before 0, 32, 64, 96 and 128
-        assert train_low.main([*TINY, "--out", str(broken)]) == 0
-    assert "stopped by the test" in "".join(capfd.readouterr())
-    assert sorted(p.name for p in (broken / "checkpoints").iterdir())[-1] == "step-000000000128"
+    last = broken / "checkpoints/step-000000000096"
+    kill_run("train_low.py", [*TINY, "--out", str(broken)], last)
     assert weights(broken) != weights(whole)
-    flip(broken / "checkpoints/step-000000000128")
+    flip(newest(broken))
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
     assert "its checksum does not match" in "".join(capfd.readouterr())
     assert final(broken) == final(whole)
@@ -283,6 +349,80 @@ def test_a_resumed_run_ends_as_one_that_never_stopped(
     # A finished run has nothing left to do; more steps than its own go on from its end.
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
     assert final(broken) == final(whole)
+
+
+def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five updates of the recurrent learner with a checkpoint after each, killed after three."""
+    arguments = [
+        "--seed", "3", "--n-envs", "2", "--workers", "1", "--steps", "40",
+        "--set", "checkpoint_steps=8", "--set", "log_steps=16", "--set", "ppo.n_steps=4",
+        "--set", "ppo.minibatches=2", "--set", "ppo.n_epochs=2", "--set", "ppo.lstm=8",
+        "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.6",
+    ]  # fmt: skip
+    monkeypatch.chdir(ROOT)  # the shipped low level is named from there
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    assert train_high.main([*arguments, "--out", str(whole)]) == 0
+    assert [row["steps"] for row in rows(whole)] == [16, 32]
+    last = broken / "checkpoints/step-000000000024"
+    kill_run("train_high.py", [*arguments, "--out", str(broken)], last)
+    assert newest(broken) < newest(broken).with_name("step-000000000040")
+    assert train_high.main(["--resume", "--out", str(broken)]) == 0
+    assert final(broken) == final(whole)
+
+
+def test_faults_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A full disk, a killed worker, a stop; then workers that are killed again and again."""
+    arguments = [
+        *TINY, "--n-envs", "2", "--workers", "1", "--steps", "160", "--out", str(tmp_path),
+        "--set", "plane_steps=1000", "--set", "checkpoint_steps=16", "--set", "log_steps=16",
+    ]  # fmt: skip
+    full = contextlib.ExitStack()
+
+    def kill_worker() -> None:
+        (worker,) = multiprocessing.active_children()
+        worker.kill()
+
+    def upset(call: int, interruption: Interruption) -> None:
+        if call == 2:
+            full.enter_context(no_file_larger_than(100))
+        elif call == 3:
+            full.close()
+            kill_worker()
+        elif call == 5:
+            interruption.reason = "the test"
+
+    with monkeypatch.context() as patch, full:
+        at_calls(patch, upset)
+        assert train_low.main(arguments) == 0
+    output = capsys.readouterr().out
+    assert "no checkpoint at 16 steps, the one before stays: [Errno 27] File too large" in output
+    assert "no log row at 32 steps: [Errno 27] File too large" in output
+    seed = worker_seed(3, 0, 1)
+    assert f"worker 0 died (exit code -9); started anew with seed {seed} (restart 1)" in output
+    assert f"stopped by the test; --resume --out {tmp_path} goes on" in output
+    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert names == ["step-000000000048", "step-000000000064"]
+    assert [row["steps"] for row in rows(tmp_path)] == [16, 48, 64]
+    (fault,) = rows(tmp_path)[1].pop("faults")
+    assert (fault["steps"], fault["seed"], fault["restarts"]) == (34, seed, 1)
+    assert [row["faults/restarts"] for row in rows(tmp_path)] == [0.0, 1.0, 0.0]
+    assert len(list((tmp_path / "tensorboard").iterdir())) == 2
+
+    with monkeypatch.context() as patch:
+        at_calls(patch, lambda call, interruption: kill_worker())
+        assert train_low.main(["--resume", "--out", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "train_low.py: 3 faults of workers within 1000 steps; the last one: worker 0 died "
+        "(exit code -9)"
+    )
+    tensors, header = read_checkpoint(newest(tmp_path))
+    assert header["num_timesteps"] == 96 and header["workers"][0]["restarts"] == 3
+    assert all(tensor.isfinite().all() for tensor in tensors.values())
+    assert not multiprocessing.active_children()
 
 
 def test_flags_and_folders_that_cannot_be_used(

@@ -41,7 +41,8 @@ class Counter:
         self.num_robots, self.seed, self.fails = robots, seed, fails
         self.steps = np.zeros(robots)
         self.sums = np.zeros(robots)
-        self.restarts = 0
+        self.worlds = 0
+        self.rng = np.random.default_rng(seed)
 
     def reset(self, index: Any) -> None:
         self.steps[index] = self.sums[index] = 0.0
@@ -60,17 +61,18 @@ class Counter:
         return np.stack([number, self.steps, self.sums], axis=1).astype(np.float32)
 
     def restart(self) -> None:
-        self.restarts += 1
+        self.worlds += 1
         self.reset(np.arange(self.num_robots))
 
     def take_stats(self) -> dict[str, float]:
-        return {"robots": float(self.num_robots), "restarts": float(self.restarts)}
+        return {"robots": float(self.num_robots), "worlds": float(self.worlds)}
 
     def state_dict(self) -> dict[str, Any]:
-        return {"seed": self.seed, "restarts": self.restarts}
+        rng = self.rng.bit_generator.state
+        return {"seed": self.seed, "worlds": self.worlds, "rng": rng}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.restarts = state["restarts"]
+        self.worlds = state["worlds"]
 
     def close(self) -> None:
         pass
@@ -100,7 +102,7 @@ def test_workers_compute_what_the_tasks_do() -> None:
     tasks = [make_robots(2, worker_seed(7, k)) for k in range(2)]
     spaces = tasks[0].observation_space, tasks[0].action_space
     env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
-    observation = env.reset()
+    observation: Any = env.reset()
     for task in tasks:
         task.restart()
     np.testing.assert_array_equal(observation, np.concatenate([t.observe() for t in tasks]))
@@ -127,7 +129,8 @@ def test_workers_compute_what_the_tasks_do() -> None:
                 ends += 1
     assert ends > 2
     states = env.state_dicts()
-    assert json.loads(json.dumps(states)) == [task.state_dict() for task in tasks]
+    expected_states = [{**task.state_dict(), "restarts": 0} for task in tasks]
+    assert json.loads(json.dumps(states)) == expected_states
     # Loading them into other workers gives the same future.
     for task in tasks:
         task.close()
@@ -146,6 +149,7 @@ def test_ends_of_episodes(counters: TaskVecEnv) -> None:
     assert first.dtype == np.float32
     actions = np.arange(10, dtype=np.float32).reshape(5, 2) / 10
     sums = actions.sum(axis=1)
+    observation: Any
     observation, rewards, dones, infos = counters.step(actions)
     np.testing.assert_allclose(rewards, sums, rtol=1e-6)
     assert not dones.any() and infos == [{}] * 5
@@ -187,9 +191,10 @@ def test_statistics_and_states_of_each_worker(counters: TaskVecEnv) -> None:
     assert all(s["busy_seconds"] > 0.0 for s in stats)
     states = counters.state_dicts()
     assert [s["seed"] for s in states] == [worker_seed(3, 0), worker_seed(3, 1)]
-    counters.load_state_dicts([{"restarts": 50}, {"restarts": 60}])
+    assert [s["restarts"] for s in states] == [0, 0]
+    counters.load_state_dicts([{"worlds": 50}, {"worlds": 60}])  # as old checkpoints have them
     counters.reset()
-    assert [s["restarts"] for s in counters.stats()] == [51.0, 61.0]
+    assert [s["worlds"] for s in counters.stats()] == [51.0, 61.0]
     with pytest.raises(ValueError, match=r"^states of 1 workers do not fit 2$"):
         counters.load_state_dicts(states[:1])
 
@@ -207,6 +212,7 @@ def test_what_a_batched_world_cannot_answer(counters: TaskVecEnv) -> None:
 def test_a_terminals_interrupt_is_the_parents_to_answer(counters: TaskVecEnv) -> None:
     for pid in counters.worker_pids:
         os.kill(pid, signal.SIGINT)
+        os.kill(pid, signal.SIGTERM)
     assert counters.reset().shape == (5, 3)
     assert all(process.is_alive() for process in counters._processes)
 
@@ -217,11 +223,17 @@ def test_number_of_workers(workers: int) -> None:
         TaskVecEnv(make_counter, 3, workers, seed=0, spaces=SPACES)
 
 
+def test_no_time_to_answer() -> None:
+    with pytest.raises(ValueError, match=r"^the workers' timeout must be above 0 s, not -1$"):
+        TaskVecEnv(make_counter, 3, 1, seed=0, spaces=SPACES, timeout=-1.0)
+
+
 def test_worker_seeds() -> None:
-    seeds = [worker_seed(seed, worker) for seed in range(20) for worker in range(4)]
-    assert len(set(seeds)) == 80
+    seeds = [worker_seed(s, k, n) for s in range(20) for k in range(4) for n in range(3)]
+    assert len(set(seeds)) == 240
     assert all(0 <= seed < 2**32 for seed in seeds)
-    assert worker_seed(1, 2) == worker_seed(1, 2)
+    # Of a first start, as checkpoints of older runs expect them.
+    assert worker_seed(3, 1) == worker_seed(3, 1, 0) == 457190280
 
 
 def test_workers_that_raise_or_are_killed_are_named_and_close_leaves_none() -> None:

@@ -124,6 +124,31 @@ def test_heightfield_of_several_clients_and_after_a_redraw() -> None:
     world.close()
 
 
+def test_a_field_that_never_changes_is_uploaded_as_flat_as_it_is() -> None:
+    families = ["rough", "gap", "gap", "gap", "gap", "gap", "pillar", "stair", "tilt", "mixed"]
+    for field in (tiles(families), tiles(["gap"] * 12), TileField((1, 1), crop=2.0)):
+        field.heights.setflags(write=False)
+        world = World(field.shape[0], ROBOT, PHYSICS, field)
+        assert_rays_hit_the_field(world, 5)
+        for client in world._clients:
+            heights = field.heights[client.samples]
+            (_, _, low), (_, _, high) = client.getAABB(client.ground)
+            # Bullet's box has a margin of a few cm. Redrawable fields reach from -2.1 to 2.1 m.
+            assert low == pytest.approx(heights.min(), abs=0.05)
+            assert high == pytest.approx(heights.max(), abs=0.05)
+        world.close()
+
+
+def test_a_robot_walks_alike_on_a_field_that_never_changes() -> None:
+    fixed = tiles(["stair", "rough"])
+    fixed.heights.setflags(write=False)
+    np.testing.assert_allclose(
+        trajectory(World(2, ROBOT, PHYSICS, fixed), 1),
+        trajectory(World(2, ROBOT, PHYSICS, tiles(["stair", "rough"])), 1),
+        atol=1e-6,
+    )
+
+
 def test_a_robot_stands_on_its_own_tile_in_every_client() -> None:
     """Eleven flat tiles, each at another height."""
     ground = np.linspace(-0.5, 0.5, 11)
@@ -361,13 +386,10 @@ def free_spot(field: TileField, row: int, rng: np.random.Generator) -> Array:
             return spot
 
 
-@pytest.mark.parametrize("family", ALL_FAMILIES)
-def test_feet_do_not_sink(family: str) -> None:
-    """Level 10, actions drawn anew each control step from all of their range: at most 0.1 % of
-    foot samples are more than 1 cm below the surface. Robots that fall or leave
-    their tile start again elsewhere."""
-    robots, index, rng = 16, np.arange(16), np.random.default_rng(10)
-    field = tiles([family] * robots, crop=1.0, seed=10)
+def sinking(family: str, seed: int) -> tuple[int, int]:
+    """Foot samples on the tile, and those more than 1 cm below its surface."""
+    robots, index, rng = 16, np.arange(16), np.random.default_rng(seed)
+    field = tiles([family] * robots, crop=1.0, seed=seed)
     loco = Locomotion(robots, ROBOT, PHYSICS, field)
     world, samples, sunk = loco.world, 0, 0
     done = np.ones(robots, dtype=bool)
@@ -386,7 +408,16 @@ def test_feet_do_not_sink(family: str) -> None:
         position = world.state.position
         done = is_fallen(world) | ~field.on_tile(index, 0, position[:, 0], position[:, 1])
     world.close()
-    assert samples > 15_500
+    return samples, sunk
+
+
+@pytest.mark.parametrize("family", ALL_FAMILIES)
+def test_feet_do_not_sink(family: str) -> None:
+    """Level 10, actions drawn anew each control step from all of their range: at most 0.1 % of
+    foot samples are more than 1 cm below the surface. Robots that fall or leave their tile start
+    again elsewhere. Three seeds together: one foot caught in a wall is 0.1 % of one seed's."""
+    samples, sunk = np.sum([sinking(family, seed) for seed in (10, 11, 12)], axis=0)
+    assert samples > 46_500
     assert sunk <= 0.001 * samples
 
 
@@ -490,6 +521,11 @@ def test_a_robot_on_terrain_does_not_depend_on_the_others() -> None:
     one = trajectory(World(3, ROBOT, PHYSICS, tiles(families)), 2)
     other = trajectory(World(3, ROBOT, PHYSICS, tiles(families)), 2, others=-0.5)
     np.testing.assert_array_equal(other, one)
+
+
+def test_visuals_do_not_change_how_a_robot_moves() -> None:
+    drawn, plain = (World(2, ROBOT, PHYSICS, visual=visual) for visual in (True, False))
+    np.testing.assert_array_equal(trajectory(drawn, 1), trajectory(plain, 1))
 
 
 def test_retired_robots_are_gone_and_the_others_go_on() -> None:

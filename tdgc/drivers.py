@@ -1,0 +1,144 @@
+"""Who decides on commands: the hierarchy's high level, or the paper's scripted baseline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from tdgc import policies
+from tdgc.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, from_dict
+from tdgc.high_env import SEMANTIC, check_pair, high_layout, observe_high
+from tdgc.locomotion import Locomotion
+from tdgc.policies import Policy
+from tdgc.robot import Array, wrap_angle
+
+
+class Driver(Protocol):
+    """Drives robots to their goals, step by step."""
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        """New episodes for all robots of ``loco``; ``goal`` (M, 2) m in the world."""
+
+    def command(self, step: int) -> Array:
+        """Commands (M, 15) for the coming control step number ``step``."""
+
+
+@dataclass(frozen=True)
+class GoToGoal:
+    """``gp``, the paper's baseline: a scripted law over the same frozen low level.
+
+    Walks in trot with default behaviour parameters, as fast as the distance asks, turning by the
+    heading error, and slows while it faces away. No terrain cues. Gains tuned on training tiles
+    (docs/experiments.md).
+    """
+
+    top_speed: float = 0.5  # m/s
+    distance_gain: float = 1.0  # 1/s
+    heading_gain: float = 1.5  # 1/s
+    swing_height: float = 0.16  # m
+
+    def law(self, position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
+        """Forward speed and yaw rate: positions (M, 2), headings (M,), goals (M, 2)."""
+        offset = goal - position
+        error = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - yaw)
+        speed = np.minimum(self.top_speed, self.distance_gain * np.linalg.norm(offset, axis=1))
+        turn = np.clip(self.heading_gain * error, *CommandRanges().yaw_rate)
+        return speed * np.maximum(np.cos(error), 0.0), turn
+
+
+class BaselineDriver:
+    """Drives robots by ``GoToGoal``; it knows no families."""
+
+    def __init__(self, law: GoToGoal | None = None) -> None:
+        self.law = law or GoToGoal()
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        self._loco, self._goal = loco, goal
+        self._command = np.tile(default_command(), (loco.num_robots, 1))
+        self._command[:, INDEX["swing_height"]] = self.law.swing_height
+
+    def command(self, step: int) -> Array:
+        state = self._loco.world.state
+        speed, turn = self.law.law(state.position[:, :2], state.yaw, self._goal)
+        self._command[:, INDEX["vx"]], self._command[:, INDEX["yaw_rate"]] = speed, turn
+        return self._command
+
+
+class HierarchyDriver:
+    """Drives robots by the recurrent high level (paper Sec. IV-B), ``tdgc``.
+
+    A decision is deterministic and its commands are held for ``decimation`` control steps.
+
+    Args:
+        high, config: what ``load_high`` returned.
+    """
+
+    def __init__(self, high: Policy, config: HighLevelConfig) -> None:
+        self._high, self._config = high, config
+        self._decoder = CommandDecoder(config.commands, config.action_limit)
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        m, config = loco.num_robots, self._config
+        self._loco, self._goal = loco, goal
+        seen = SEMANTIC.index(family if family in SEMANTIC else "unknown")
+        self._families = np.full(m, seen)
+        self._horizon = round(
+            config.episode_seconds / (config.decimation * loco.physics.control_dt)
+        )
+        self._state: policies.State | None = None
+        self._action = np.zeros((m, NUM_ACTIONS))
+
+    def command(self, step: int) -> Array:
+        decision, held = divmod(step, self._config.decimation)
+        if held == 0:
+            observation = observe_high(
+                self._loco,
+                self._goal,
+                np.full(self._loco.num_robots, decision / self._horizon),
+                self._action,
+                self._families,
+                self._config.cues,
+            )
+            action, self._state = self._high.predict(observation, self._state)
+            self._action = self._decoder.normalise(action)
+            self._command = self._decoder.decode(action)
+        return self._command
+
+
+def load_high(
+    path: str | Path, low: Policy, low_config: LowLevelConfig
+) -> tuple[Policy, HighLevelConfig]:
+    """A high-level policy and the MDP it was trained on, for use on the low level ``low``.
+
+    Raises:
+        ValueError: a file that cannot be used, one that is no high level, or one that was trained
+            on a low level with another observation, control rate or narrower commands; the message
+            names the mismatch.
+    """
+    high = policies.load(path)
+    if high.kind != "lstm" or high.action_dim != NUM_ACTIONS:
+        raise ConfigError(f"{path}: not a high-level policy of this package")
+    try:
+        config = from_dict(HighLevelConfig, high.meta["config"])
+        trained_on = from_dict(LowLevelConfig, high.meta["low"]["config"])
+        observation = high.meta["low"]["observation"]
+    except (KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: its meta lacks what it was trained on") from error
+    size = sum(width for _, width in high_layout(config.cues))
+    for what, wanted, given in (
+        ("a high level that observes {} values", size, high.obs_dim),
+        ("a low level that observes {} values", observation, low.actor_dim),
+        (
+            "a low level with a control step of {} s",
+            trained_on.physics.control_dt,
+            low_config.physics.control_dt,
+        ),
+    ):
+        if wanted != given:
+            raise ConfigError(f"{path}: trained for {what.format(wanted)}, not {given}")
+    check_pair(config, low_config)
+    return high, config

@@ -1,0 +1,209 @@
+"""Who decides on commands: the baseline's law, the hierarchy as it was trained, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from tdgc import policies
+from tdgc.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
+from tdgc.config import (
+    CommandRanges,
+    ConfigError,
+    HighLevelConfig,
+    LowLevelConfig,
+    PhysicsConfig,
+    RandomisationConfig,
+    to_dict,
+)
+from tdgc.drivers import BaselineDriver, GoToGoal, HierarchyDriver, load_high
+from tdgc.high_env import PRETRAINED, SEMANTIC, NavigationTask, high_layout, load_low, observe_high
+from tdgc.locomotion import Locomotion
+from tdgc.policies import Policy
+from tdgc.recurrent import FastRecurrentPolicy
+from tdgc.robot import Array
+
+LOW = PRETRAINED / "low"
+CONFIG = HighLevelConfig(randomisation=RandomisationConfig(scale=0.0))
+
+
+def save_high(
+    path: Path,
+    low: tuple[Policy, LowLevelConfig],
+    config: HighLevelConfig = CONFIG,
+    size: int | None = None,
+    meta: dict[str, Any] | None = None,
+) -> Path:
+    """A small high level with random weights that walks about: gaits and commands vary."""
+    size = size or sum(width for _, width in high_layout(config.cues))
+    policy = FastRecurrentPolicy(
+        spaces.Box(-np.inf, np.inf, (size,)),
+        spaces.Box(-config.action_limit, config.action_limit, (NUM_ACTIONS,)),
+        lambda _: 0.0,
+        lstm_hidden_size=8,
+        net_arch={"pi": [8], "vf": [8]},
+    )
+    generator = th.Generator().manual_seed(3)
+    walk = default_command()
+    walk[INDEX["vx"]] = 0.6
+    with th.no_grad():
+        for parameter in policy.parameters():
+            if parameter.dim() == 2:
+                noise = th.randn(parameter.shape, generator=generator)
+                parameter.copy_(noise / parameter.shape[-1] ** 0.5)
+        policy.lstm_actor.weight_ih_l0.mul_(8.0)  # quick to change its mind
+        policy.action_net.weight[:-1].mul_(0.5)
+        policy.action_net.weight[-1].mul_(2.0)  # the gait
+        policy.action_net.bias.copy_(th.from_numpy(CommandDecoder().encode(walk)))
+    trained_on = {"config": to_dict(low[1]), "observation": low[0].actor_dim}
+    policies.save(path, policy, {"config": to_dict(config), "low": trained_on} | (meta or {}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def low() -> tuple[Policy, LowLevelConfig]:
+    return load_low(LOW)
+
+
+# ------------------------------------------------------------------ gp
+
+
+def test_go_to_goal_turns_to_the_goal_and_slows_while_it_faces_away():
+    law = GoToGoal(top_speed=0.8, distance_gain=1.0, heading_gain=1.5)
+    position = np.zeros((4, 2))
+    goal = np.array([[5.0, 0.0], [0.0, 5.0], [-5.0, 1e-9], [0.3, 0.0]])
+    speed, turn = law.law(position, np.zeros(4), goal)
+    assert speed == pytest.approx([0.8, 0.0, 0.0, 0.3], abs=1e-9)
+    assert turn == pytest.approx([0.0, 1.0, 1.0, 0.0], abs=1e-9)  # 1.5 * pi/2 is above the bound
+    _, right = law.law(np.zeros((1, 2)), np.array([0.4]), np.array([[5.0, 0.0]]))
+    assert right == pytest.approx([-0.6])
+
+
+def test_baseline_holds_the_default_behaviour_parameters(low):
+    config = low[1]
+    loco = Locomotion(1, config.robot, config.physics, None)
+    try:
+        driver = BaselineDriver()
+        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+        driver.begin(loco, np.array([[6.5, 0.0]]), "stair")
+        command = driver.command(0)[0]
+        expected = default_command()
+        expected[INDEX["vx"]] = driver.law.top_speed
+        expected[INDEX["swing_height"]] = driver.law.swing_height
+        assert command == pytest.approx(expected)
+    finally:
+        loco.world.close()
+
+
+# ------------------------------------------------------------------ tdgc
+
+
+def test_hierarchy_decides_in_the_evaluation_as_in_its_environment(low, tmp_path):
+    """Observation, LSTM state, last action and clock of the environment, decision by decision."""
+    config = dataclasses.replace(CONFIG, families=("gap",))
+    high, loaded = load_high(save_high(tmp_path / "high", low, config), *low)
+    assert loaded == config
+    task = NavigationTask(config, LOW, 2, seed=1, training=False)
+    try:
+        task.reset(np.arange(2))
+        driver = HierarchyDriver(high, loaded)
+        driver.begin(task.locomotion, task.goal, "gap")
+        state, seen = None, []
+        for decision in range(4):
+            action, state = high.predict(task.observe(), state)
+            for step in range(5):
+                command = driver.command(5 * decision + step)
+                assert np.array_equal(command, task.decoder.decode(action))
+            seen.append(command)
+            task.step(action)
+        assert (np.ptp(seen, axis=0).max(axis=0)[:3] > 1e-3).all()  # it does react
+        # New episodes: nothing of the old ones is left in the state.
+        task.reset(np.arange(2))
+        first, _ = high.predict(task.observe())
+        driver.begin(task.locomotion, task.goal, "gap")
+        assert np.array_equal(driver.command(0), task.decoder.decode(first))
+    finally:
+        task.close()
+
+
+def test_commands_are_held_between_decisions(low, tmp_path):
+    high, config = load_high(save_high(tmp_path / "high", low), *low)
+    loco = Locomotion(1, low[1].robot, low[1].physics, None)
+    try:
+        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+        driver = HierarchyDriver(high, config)
+        driver.begin(loco, np.array([[6.5, 0.0]]), "rough")
+        commands = []
+        for step in range(2 * config.decimation):
+            commands.append(driver.command(step).copy())
+            loco.world.state.q += 0.1  # something to react to
+        changed = [not np.array_equal(a, b) for a, b in pairwise(commands)]
+        assert np.flatnonzero(changed).tolist() == [4]
+    finally:
+        loco.world.close()
+
+
+def test_mixed_terrain_is_unknown_to_the_high_level(low, tmp_path):
+    high, config = load_high(save_high(tmp_path / "high", low), *low)
+    loco = Locomotion(1, low[1].robot, low[1].physics, None)
+    try:
+        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+        goal = np.array([[6.5, 0.0]])
+
+        def first_command(family: str) -> Array:
+            driver = HierarchyDriver(high, config)
+            driver.begin(loco, goal, family)
+            return driver.command(0)
+
+        def expected(index: int) -> Array:
+            zero, families = np.zeros((1, NUM_ACTIONS)), np.array([index])
+            observation = observe_high(loco, goal, np.zeros(1), zero, families, config.cues)
+            return CommandDecoder().decode(high.predict(observation)[0])
+
+        for family in ("rough", "tilt"):
+            assert np.array_equal(first_command(family), expected(SEMANTIC.index(family)))
+        assert np.array_equal(first_command("mixed"), expected(len(SEMANTIC) - 1))
+        assert not np.array_equal(first_command("mixed"), first_command("rough"))
+    finally:
+        loco.world.close()
+
+
+# ------------------------------------------------------------------ pairs that do not fit
+
+
+def test_a_low_level_that_does_not_match_is_refused_by_name(low, tmp_path):
+    policy, config = low
+    path = save_high(tmp_path / "high", low)
+    slow = dataclasses.replace(config, physics=PhysicsConfig(control_dt=0.04))
+    with pytest.raises(ConfigError, match=r"high: .* a control step of 0.02 s, not 0.04$"):
+        load_high(path, policy, slow)
+    narrow = dataclasses.replace(
+        config, commands=dataclasses.replace(CommandRanges(), vy=(-0.3, 0.3))
+    )
+    with pytest.raises(ConfigError, match=r"commands.vy asks for \[-0.6, 0.6\].*\[-0.3, 0.3\]"):
+        load_high(path, policy, narrow)
+    other = {"config": to_dict(config), "observation": policy.actor_dim - 3}
+    path = save_high(tmp_path / "other", low, meta={"low": other})
+    n = policy.actor_dim
+    with pytest.raises(ConfigError, match=f"low level that observes {n - 3} values, not {n}$"):
+        load_high(path, *low)
+
+
+def test_files_that_are_no_high_level_are_refused(low, tmp_path):
+    with pytest.raises(ConfigError, match=r"low: not a high-level policy of this package$"):
+        load_high(LOW, *low)
+    path = save_high(tmp_path / "high", low, meta={"low": None})
+    with pytest.raises(ConfigError, match=r"high: its meta lacks what it was trained on$"):
+        load_high(path, *low)
+    path = save_high(tmp_path / "high", low, size=80)
+    with pytest.raises(ConfigError, match=r"high level that observes 86 values, not 80$"):
+        load_high(path, *low)
+    with pytest.raises(policies.PolicyFileError, match=r"none.json: no such file$"):
+        load_high(tmp_path / "none", *low)

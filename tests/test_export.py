@@ -1,0 +1,464 @@
+"""Exported policies: each graph is the simulator's own step, and a robot needs nothing else."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from tdgc import export, policies
+from tdgc.commands import CommandDecoder
+from tdgc.config import CommandRanges, HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
+from tdgc.export import FORMATS, TOLERANCE, Graph, HighLevel, LowLevel
+from tdgc.gaits import GAIT_TABLE, PhaseClock, gait_embedding
+from tdgc.high_env import PRETRAINED, NavigationTask, high_layout, load_low, observe_high
+from tdgc.locomotion import (
+    ACTOR_LAYOUT,
+    GYRO_LAYOUT,
+    MIRRORS,
+    Locomotion,
+    action_mirror,
+    mirror_map,
+)
+from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
+from tdgc.recurrent import FastRecurrentPolicy
+from tdgc.robot import JOINTS, joint_targets
+
+LOW = PRETRAINED / "low"
+LOW_POLICY, LOW_CONFIG = load_low(LOW)
+
+
+def unbounded(size: int) -> spaces.Box:
+    return spaces.Box(-np.inf, np.inf, (size,))
+
+
+def shake(policy: ActorCriticPolicy) -> None:
+    """Random parameters that give actions within and beyond their bounds."""
+    generator = th.Generator().manual_seed(0)
+    with th.no_grad():
+        for parameter in policy.parameters():
+            scale = parameter.shape[-1] ** -0.5 if parameter.dim() == 2 else 0.3
+            parameter.copy_(scale * th.randn(parameter.shape, generator=generator))
+
+
+def random_high(
+    path: Path, config: HighLevelConfig, low: LowLevelConfig = LOW_CONFIG, hidden: int = 32
+) -> Path:
+    """A high level with random weights, saved as ``train_high.py`` saves one."""
+    size = sum(n for _, n in high_layout(config.cues))
+    limit = config.action_limit
+    policy = FastRecurrentPolicy(
+        unbounded(size), spaces.Box(-limit, limit, (13,)), lambda _: 1e-3,
+        lstm_hidden_size=hidden, net_arch={"pi": [hidden], "vf": [4]},
+    )  # fmt: skip
+    shake(policy)
+    trained_on = {"config": to_dict(low), "observation": LOW_POLICY.actor_dim}
+    policies.save(path, policy, {"config": to_dict(config), "low": trained_on, "seed": 7})
+    return path
+
+
+def random_low(path: Path, config: LowLevelConfig, symmetric: bool) -> Policy:
+    layout = ACTOR_LAYOUT + (GYRO_LAYOUT if config.gyro else ())
+    size = sum(n for _, n in layout)
+    limit = config.robot.action_limit
+    mirror = None
+    if symmetric:
+        parts = (*mirror_map(layout, MIRRORS), *action_mirror())
+        mirror = Mirror(*(tuple(part.tolist()) for part in parts))
+    policy = AsymmetricActorCriticPolicy(
+        unbounded(size), spaces.Box(-limit, limit, (12,)), lambda _: 1e-3,
+        actor_dim=size, mirror=mirror, net_arch=[32],
+    )  # fmt: skip
+    shake(policy)
+    policies.save(path, policy, {"config": to_dict(config)})
+    return policies.load(path)
+
+
+def random_commands(rng: np.random.Generator, count: int) -> np.ndarray:
+    decoder = CommandDecoder()
+    commands = rng.uniform(decoder.low, decoder.high, (count, 15))
+    commands[:, 12:] = gait_embedding(np.arange(count) % 4)
+    return commands
+
+
+def disturb(loco: Locomotion, rng: np.random.Generator) -> None:
+    """Any state a robot could be in, and more."""
+    state, m = loco.world.state, loco.num_robots
+    state.position[:] = rng.uniform(0.5, 3.0, (m, 3))
+    turn = rng.normal(size=(m, 4))
+    state.quaternion[:] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+    state.ang_vel[:] = rng.normal(0.0, 2.0, (m, 3))
+    state.q[:] = rng.normal(0.0, 1.0, (m, 12))
+    state.qd[:] = rng.normal(0.0, 10.0, (m, 12))
+    state.derive()
+    loco.joint_offset[:] = rng.uniform(-0.02, 0.02, (m, 12))
+    loco.clock.clock = rng.uniform(size=m)
+    loco.command[:] = random_commands(rng, m)
+
+
+def body(loco: Locomotion, k: int) -> dict[str, np.ndarray]:
+    """What the sensors of robot ``k`` say."""
+    state = loco.world.state
+    return {
+        "gravity": state.gravity[k],
+        "joint_angles": (state.q - loco.joint_offset)[k],
+        "joint_speeds": state.qd[k].copy(),
+        "gyro": state.rotation[k].T @ state.ang_vel[k],
+    }
+
+
+def run(level: LowLevel | HighLevel, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Outputs by name of a graph before its export."""
+    inputs = [th.as_tensor(values[s.name], dtype=th.float64) for s in level.inputs]
+    assert [tuple(x.shape) for x in inputs] == [(s.size,) for s in level.inputs]
+    outputs = level(*inputs)
+    assert [tuple(x.shape) for x in outputs] == [(s.size,) for s in level.outputs]
+    assert all(x.dtype == th.float64 for x in outputs)
+    return {s.name: x.numpy() for s, x in zip(level.outputs, outputs, strict=True)}
+
+
+@pytest.fixture(scope="module")
+def high(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("high") / "policy"
+    return random_high(path, HighLevelConfig())
+
+
+@pytest.fixture(scope="module")
+def folder(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both levels in all formats: the shipped low level and a random high level."""
+    path = tmp_path_factory.mktemp("export")
+    export.write(export.load_pair(LOW, high), path, list(FORMATS))
+    return path
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Undo what a script's main does to the process."""
+    threads = th.get_num_threads()
+    yield
+    th.set_num_threads(threads)
+
+
+# --- the graphs' mathematics --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("gyro", "symmetric"), [(False, True), (True, False)])
+def test_low_level_is_the_executors_step(tmp_path: Path, gyro: bool, symmetric: bool) -> None:
+    robot = RobotConfig(action_limit=0.6, hip_scale=0.4, nominal_hip=0.07)
+    config = LowLevelConfig(gyro=gyro, robot=robot)
+    policy = random_low(tmp_path / "low", config, symmetric)
+    level = LowLevel(policy, config)
+    m, rng = 24, np.random.default_rng(0)
+    loco = Locomotion(m, config.robot, config.physics, None, gyro)
+    try:
+        disturb(loco, rng)
+        loco.actions = rng.uniform(-0.6, 0.6, (2, m, 12))
+        sensed = [body(loco, k) for k in range(m)]
+        history, clock = loco.actions, loco.clock.clock
+        actions, _ = policy.predict(loco.observe())
+        loco.act(actions)
+        for k in range(m):
+            own = {"last_action": history[0, k], "action_before": history[1, k]}
+            given = {"commands": loco.command[k], "clock": clock[k : k + 1]}
+            got = run(level, sensed[k] | own | given)
+            assert got["action"] == pytest.approx(loco.actions[0, k], abs=3e-6)
+            assert got["joint_targets"] == pytest.approx(loco.targets[0, k], abs=1e-6)
+            assert got["next_clock"] == pytest.approx(loco.clock.clock[k], abs=1e-15)
+        at_limit = np.abs(loco.actions[0]) == 0.6
+        assert 20 < at_limit.sum() < at_limit.size - 20
+    finally:
+        loco.world.close()
+
+
+@pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])
+def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: str) -> None:
+    narrow = dataclasses.replace(CommandRanges(), vx=(-0.5, 0.8), pitch=(0.0, 0.0))
+    config = HighLevelConfig(cues=cues, action_limit=2.0, decimation=4, commands=narrow)
+    policy = policies.load(random_high(tmp_path / "high", config))
+    level = HighLevel(policy, config, LOW_CONFIG)
+    task = NavigationTask(config, LOW, 5, seed=2, training=False)
+    loco, rng = task.locomotion, np.random.default_rng(1)
+    try:
+        task.reset(np.arange(5))
+        disturb(loco, rng)
+        loco.clock.update(loco.command[:, 12:], loco.command[:, 5])
+        last = rng.uniform(-3.0, 3.0, (5, 13)).astype(np.float32)
+        memory = rng.normal(0.0, 0.5, (2, 5, 32)).astype(np.float32)
+        elapsed = np.arange(5) * 17
+        seen = observe_high(
+            loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
+            task.family_index, cues,
+        )  # fmt: skip
+        wanted, (hidden, cell) = policy.predict(seen, (memory[:1], memory[1:]))
+        state = loco.world.state
+        for k in range(5):
+            c, s = np.cos(state.yaw[k]), np.sin(state.yaw[k])
+            x, y = task.goal[k] - state.position[k, :2]
+            heights = np.zeros(32) if cues in ("none", "semantic") else 0.5 * seen[k, -32:]
+            got = run(
+                level,
+                body(loco, k)
+                | {
+                    "goal": np.array([c * x + s * y, c * y - s * x]),
+                    "time_left": np.array([20.0 - elapsed[k] * 0.08]),
+                    "last_decision": last[k],
+                    "last_commands": loco.command[k],
+                    "clock": loco.clock.clock[k : k + 1],
+                    "family": np.eye(6)[k],
+                    "probes": np.where(np.abs(heights) < 0.5, heights, 3.0 * heights),
+                    "hidden": memory[0, k],
+                    "cell": memory[1, k],
+                },
+            )
+            assert got["decision"] == pytest.approx(wanted[k], abs=3e-6)
+            assert got["commands"] == pytest.approx(task.decoder.decode(wanted[k]), abs=3e-6)
+            assert got["next_hidden"] == pytest.approx(hidden[0, k], abs=1e-6)
+            assert got["next_cell"] == pytest.approx(cell[0, k], abs=1e-6)
+    finally:
+        task.close()
+
+
+def test_decoding_is_the_decoders_to_the_last_bit_of_a_gait(high: Path) -> None:
+    pair = export.load_pair(LOW, high)
+    level, decoder = HighLevel(pair.high, pair.high_config, pair.low_config), CommandDecoder()
+    rng = np.random.default_rng(3)
+    actions = rng.uniform(-1.3, 1.3, (40, 13))
+    edges = np.float32([-0.5, 0.0, 0.5])
+    near = [np.nextafter(edges, np.float32(side)) for side in (-2, 2)]
+    actions[:11, -1] = [*edges, *near[0], *near[1], -1.0, 1.0]
+    for action in actions:
+        got = level._decode(th.tensor(action)).numpy()
+        assert got == pytest.approx(decoder.decode(action), abs=1e-15)
+        assert np.array_equal(got[12:], decoder.decode(action)[12:])
+
+
+def test_clock_signal_is_the_phase_clocks() -> None:
+    rng = np.random.default_rng(4)
+    commands = random_commands(rng, 200)
+    clock = rng.uniform(size=200)
+    clock[:4], clock[4:8] = 0.0, commands[4:8, 5]  # where stance begins and ends in pronk
+    phases = PhaseClock(200)
+    phases.reset(np.arange(200), clock)
+    phases.update(commands[:, 12:], commands[:, 5])
+    for k, wanted in enumerate(phases.signal()):
+        got = export.clock_signal(th.tensor(clock[k : k + 1]), th.tensor(commands[k]))
+        assert got.numpy() == pytest.approx(wanted, abs=1e-14)
+
+
+def test_goal_under_the_robot_counts_as_ahead(high: Path) -> None:
+    pair = export.load_pair(LOW, high)
+    level = HighLevel(pair.high, pair.high_config, pair.low_config)
+    rest = {s.name: np.full(s.size, 0.1) for s in level.inputs}
+    at, ahead, left = (
+        run(level, rest | {"goal": np.array(goal)})["decision"]
+        for goal in ([0.0, 0.0], [1e-9, 0.0], [0.0, 1e-9])
+    )
+    assert np.array_equal(at, ahead) and np.abs(left - at).max() > 1e-3
+
+
+# --- the files ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_graphs_drive_a_robot_as_the_policies_do(folder: Path, high: Path, form: str) -> None:
+    result = export.check(folder, form, LOW, high)
+    assert result.difference <= TOLERANCE
+    assert result.seconds.shape == (1000,) and (result.seconds >= 0.0).all()
+
+
+def test_check_finds_other_weights(tmp_path: Path) -> None:
+    short = HighLevelConfig(episode_seconds=1.0)
+    other = random_high(tmp_path / "short", short)
+    pair = export.load_pair(LOW, other)
+    export.write(pair, tmp_path, ["torchscript"])
+    assert export.check(tmp_path, "torchscript", LOW, other).difference <= TOLERANCE
+    pair.high.tensors["actor.0.weight"].mul_(1.001)
+    export.write(pair, tmp_path, ["torchscript"])
+    assert export.check(tmp_path, "torchscript", LOW, other).difference > TOLERANCE
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_clock_does_not_drift(folder: Path, form: str) -> None:
+    """1000 steps at 3.1 Hz: a step of 0.02 s rounded to float32 would be 3e-8 off by then."""
+    graph = Graph(folder, "low", form)
+    command = np.concatenate([np.full(12, 0.5), GAIT_TABLE[2]])
+    command[4] = 3.1
+    rest = {name: np.zeros(size) for name, size in
+            (("gravity", 3), ("joint_angles", 12), ("joint_speeds", 12), ("gyro", 3))}  # fmt: skip
+    for _ in range(1000):
+        graph(rest | {"commands": command})
+    assert graph.memory["clock"][0] == pytest.approx(np.mod(1000 * 0.02 * 3.1, 1.0), abs=1e-11)
+
+
+def test_graph_hands_on_what_the_interface_says(folder: Path) -> None:
+    graph = Graph(folder, "low", "onnx")
+    rest = {name: np.full(size, 0.1) for name, size in
+            (("gravity", 3), ("joint_angles", 12), ("joint_speeds", 12), ("gyro", 3))}  # fmt: skip
+    rest["commands"] = random_commands(np.random.default_rng(5), 1)[0]
+    assert not graph.memory["last_action"].any() and not graph.memory["action_before"].any()
+    first = graph(rest)
+    second = graph(rest)
+    assert np.array_equal(graph.memory["last_action"], second["action"])
+    assert np.array_equal(graph.memory["action_before"], first["action"])
+    assert np.array_equal(graph.memory["clock"], second["next_clock"])
+    assert np.abs(second["action"] - first["action"]).max() > 1e-3
+    graph.reset()
+    assert np.array_equal(graph(rest)["action"], first["action"])
+
+
+@pytest.mark.parametrize("name", ["low", "high"])
+def test_interface_names_what_the_graph_has(folder: Path, name: str) -> None:
+    table = json.loads((folder / f"{name}_interface.json").read_text())
+    session = onnxruntime.InferenceSession(folder / f"{name}.onnx")
+    for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
+        said = [(s["name"], s["shape"], s["type"]) for s in table[side]]
+        assert said == [(x.name, x.shape, "float64") for x in found]
+        assert {x.type for x in found} == {"tensor(double)"}
+    names = {s["name"] for side in ("inputs", "outputs") for s in table[side]}
+    for signal in table["inputs"] + table["outputs"]:
+        assert signal["meaning"] and signal.get("previous") in {None, *names}
+        assert ("previous" in signal) == ("start" in signal)
+        assert "unit" in signal or signal["order"] == "commands"
+        if "order" in signal:
+            order = table[signal["order"]]
+            assert (
+                len(order.get("ahead_left") if isinstance(order, dict) else order)
+                == (signal["shape"][0])
+            )
+
+
+def test_interface_says_how_to_drive_the_joints(folder: Path) -> None:
+    table = json.loads((folder / "low_interface.json").read_text())
+    assert table["rate_hz"] == 50.0 and table["joints"] == list(JOINTS)
+    control = table["joint_control"]
+    assert control["rate_hz"] == pytest.approx(400.0)
+    assert control["kp"] == {"unit": "N m/rad", "value": [20.0] * 12}
+    assert control["kd"] == {"unit": "N m s/rad", "value": [0.6] * 12}
+    assert control["torque_limit"] == {"unit": "N m", "value": [23.7, 23.7, 35.5] * 4}
+    rest = joint_targets(LOW_CONFIG.robot, np.zeros((1, 12)))[0]
+    assert control["nominal_pose"]["value"] == rest.tolist()
+    assert table["feet"] == ["FL", "FR", "RL", "RR"]
+    assert table["gaits"]["trot"] == {"phase": 0.5, "offset": 0.0, "bound": 0.0}
+    assert table["commands"][4] == {"name": "frequency", "unit": "Hz", "low": 2.0, "high": 4.0}
+    table = json.loads((folder / "high_interface.json").read_text())
+    assert table["rate_hz"] == pytest.approx(10.0) and table["control_steps"] == 5
+    assert table["policy"] == {"seed": 7}
+    assert table["families"][-1] == "unknown" and table["decision"][-1] == "gait"
+
+
+ROBOT = """
+import json, sys
+import numpy as np, onnxruntime, torch
+table = json.load(open("low_interface.json"))
+values = [np.full(s["shape"], 0.3) for s in table["inputs"]]
+session = onnxruntime.InferenceSession("low.onnx")
+by_onnx = session.run(None, {s["name"]: v for s, v in zip(table["inputs"], values)})
+by_torch = torch.jit.load("low.pt")(*map(torch.from_numpy, values))
+assert not [name for name in sys.modules if name.partition(".")[0] == "tdgc"]
+print(json.dumps([[float(x) for x in outputs[1]] for outputs in (by_onnx, by_torch)]))
+"""
+
+
+def test_a_robot_needs_no_part_of_this_package(folder: Path) -> None:
+    command = [sys.executable, "-W", "ignore", "-I", "-c", ROBOT]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    level = LowLevel(LOW_POLICY, LOW_CONFIG)
+    wanted = run(level, {s.name: np.full(s.size, 0.3) for s in level.inputs})["joint_targets"]
+    for targets in json.loads(result.stdout):
+        assert targets == pytest.approx(wanted, abs=1e-6)
+
+
+# --- the command --------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_command_writes_checks_and_reports(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    short = HighLevelConfig(episode_seconds=1.0)
+    high = random_high(tmp_path / "high", short)
+    out = tmp_path / "new" / "out"
+    arguments = ["--high", str(high), "--out", str(out), "--format", "torchscript"]
+    assert export.main(arguments) == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        "high.pt", "high_interface.json", "low.pt", "low_interface.json"
+    ]  # fmt: skip
+    said = capsys.readouterr()
+    assert said.err == "" and said.out.count("\n") == 1
+    assert said.out.startswith("torchscript: largest difference ")
+    assert " in 50 control steps; a step takes " in said.out
+    monkeypatch.setattr(export, "TOLERANCE", -1.0)
+    assert export.main(arguments) == 1
+    said = capsys.readouterr()
+    assert said.err.startswith("tdgc.export: torchscript differs by ")
+    assert said.err.count("\n") == 1
+
+
+def save_pairs(path: Path) -> None:
+    """High levels that do not fit the shipped low level, and one that does."""
+    fast = dataclasses.replace(CommandRanges(), vx=(-1.0, 1.5))
+    physics = dataclasses.replace(LOW_CONFIG.physics, control_dt=0.01)
+    random_high(path / "high", HighLevelConfig(), hidden=4)
+    random_high(path / "fast", HighLevelConfig(commands=fast), hidden=4)
+    random_high(
+        path / "slow", HighLevelConfig(), dataclasses.replace(LOW_CONFIG, physics=physics), hidden=4
+    )
+    for name, stem, key, value in (
+        ("blind", path / "high", "cues", "none"),
+        ("dizzy", LOW, "gyro", not LOW_CONFIG.gyro),
+    ):
+        header = json.loads(Path(f"{stem}.json").read_text())
+        header["meta"]["config"][key] = value
+        (path / f"{name}.json").write_text(json.dumps(header))
+        (path / f"{name}.safetensors").write_bytes(Path(f"{stem}.safetensors").read_bytes())
+    (path / "file").write_text("")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--high {0}/high --format onnx,tflite", "unknown format 'tflite'; allowed: onnx, torchs"),
+        ("--high {0}/absent", "absent.json: no such file"),
+        ("--high {0}/high --low {0}/absent", "absent.json: no such file"),
+        ("--high {0}/high --low {0}/high", "high: not a low-level policy"),
+        ("--high {low}", "low: not a high-level policy"),
+        ("--high {0}/fast", "commands.vx asks for [-1.0, 1.5], but the low level was trained on"),
+        ("--high {0}/slow", "trained for a low level with a control step of 0.01 s, not 0.02"),
+        ("--high {0}/blind", "trained for a high level that observes 48 values, not 86"),
+        ("--high {0}/high --low {0}/dizzy", "dizzy: its configuration gives "),
+        ("--high {0}/high --out {0}/file/out", "Not a directory"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: str, message: str
+) -> None:
+    save_pairs(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    arguments = flags.format(tmp_path, low=LOW).split()
+    assert export.main(["--out", str(tmp_path / "out"), *arguments]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("tdgc.export: ") and said.err.count("\n") == 1
+    assert message in said.err
+    assert said.out == "" and sorted(tmp_path.rglob("*")) == before
+
+
+def test_missing_package_names_the_extra(
+    tmp_path: Path,
+    high: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnxscript", None)  # as if it were not installed
+    out = tmp_path / "out"
+    assert export.main(["--high", str(high), "--out", str(out)]) == 2
+    said = capsys.readouterr()
+    assert "format onnx needs onnxscript: install the extra 'export'" in said.err
+    assert said.err.count("\n") == 1 and not out.exists()

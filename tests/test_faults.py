@@ -1,0 +1,327 @@
+"""What the workers live through: a death, a hang, an error, robots that blow up, no parent."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tdgc.config import LowLevelConfig, PhysicsConfig
+from tdgc.low_env import LowLevelTask
+from tdgc.robot import Array
+from tdgc.vec import FAULT_STEPS, Fault, TaskVecEnv, WorkerError, worker_seed
+
+# What a robot's action makes of its task.
+RAISE, DIE, HANG, NAN_SEEN, NAN_EARNED, INFINITE, FAR = range(2, 9)
+
+
+class Fragile:
+    """Robots that see their number, the level, the steps of their episode, and a random number.
+
+    The level rises with each step of the task and is all that it learns, as a curriculum is; the
+    random number is drawn at each restart. A robot earns its action.
+    """
+
+    actor_dim = 4
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+    action_space = gym.spaces.Box(-9.0, 9.0, (1,), np.float32)
+
+    def __init__(self, robots: int, seed: int) -> None:
+        self.num_robots = robots
+        self.rng = np.random.default_rng(seed)
+        self.level, self.restarts = 0, 0
+        self.restart()
+
+    def reset(self, index: Any) -> None:
+        self.steps[index] = 0
+        self.action[index] = 0.0
+
+    def step(self, actions: Any) -> tuple[Array, Any, Any]:
+        self.action = actions[:, 0].astype(np.float64)
+        if (self.action == RAISE).any():
+            raise ValueError("the ground is gone")
+        if (self.action == DIE).any():
+            os.kill(os.getpid(), signal.SIGKILL)
+        if (self.action == HANG).any():
+            time.sleep(1e6)
+        self.steps += 1
+        self.level += 1
+        reward = self.action.copy()
+        reward[self.action == NAN_EARNED] = np.nan
+        terminated = (self.action == NAN_SEEN) | (self.action == FAR)
+        return reward, terminated, np.zeros(self.num_robots, dtype=bool)
+
+    def observe(self) -> Any:
+        ones = np.ones(self.num_robots)
+        parts = [np.arange(self.num_robots), self.level * ones, self.steps, self.drawn * ones]
+        obs = np.stack(parts, axis=1).astype(np.float32)
+        for action, value in ((NAN_SEEN, np.nan), (INFINITE, -np.inf), (FAR, 1e6)):
+            obs[self.action == action, 2] = value
+        return obs
+
+    def restart(self) -> None:
+        self.restarts += 1
+        self.drawn = self.rng.uniform()
+        self.steps = np.zeros(self.num_robots)
+        self.action = np.zeros(self.num_robots)
+
+    def take_stats(self) -> dict[str, float]:
+        return {"restarts": float(self.restarts)}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"rng": self.rng.bit_generator.state, "level": self.level}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.rng.bit_generator.state = state["rng"]
+        self.level = state["level"]
+
+    def close(self) -> None:
+        pass
+
+
+SPACES = (Fragile.observation_space, Fragile.action_space)
+
+
+def actions(robots: int = 4, **asked: float) -> NDArray[np.float32]:
+    """Ones, but for the robots named as ``r2=DIE``."""
+    values = np.ones((robots, 1), dtype=np.float32)
+    for name, value in asked.items():
+        values[int(name[1:])] = value
+    return values
+
+
+def step(env: TaskVecEnv, values: NDArray[np.float32]) -> Any:
+    """Observations, rewards, ends and infos of a step."""
+    return env.step(values)
+
+
+def drawn(seed: int, count: int) -> np.float32:
+    """What a task with that seed draws at its restart number ``count``."""
+    return np.float32(np.random.default_rng(seed).uniform(size=count)[-1])
+
+
+@pytest.fixture
+def fragile() -> Iterator[TaskVecEnv]:
+    """Four robots in two workers."""
+    env = TaskVecEnv(Fragile, 4, 2, seed=3, spaces=SPACES, recover=True)
+    yield env
+    env.close()
+
+
+# ------------------------------------------------------------------ workers
+
+
+def test_workers_that_die_or_raise_are_started_anew(fragile: TaskVecEnv) -> None:
+    """The faults of worker 1; worker 0 goes on as if nothing had been."""
+    fragile.reset()
+    for _ in range(5):
+        step(fragile, actions())
+    fragile.state_dicts()  # level 5 is what is known
+    reasons = {
+        DIE: "worker 1 died (exit code -9)",
+        RAISE: "worker 1 failed: ValueError: the ground is gone",
+    }
+    for restarts, (fault, reason) in enumerate(reasons.items(), start=1):
+        seen, *_ = step(fragile, actions())
+        obs, rewards, dones, infos = step(fragile, actions(r3=fault))
+        assert dones.tolist() == [False, False, True, True]
+        assert rewards.tolist() == [1.0, 1.0, 0.0, 0.0]
+        for i in (2, 3):
+            np.testing.assert_array_equal(infos[i]["terminal_observation"], seen[i])
+            assert infos[i]["TimeLimit.truncated"]
+        # Its level is the last known one, its randomness that of a seed on record.
+        seed = worker_seed(3, 1, restarts)
+        assert obs[2:].tolist() == [[i, 5.0, 0.0, drawn(seed, 2)] for i in (0, 1)]
+        assert obs[:2, 1].tolist() == obs[:2, 2].tolist() == [seen[0, 1] + 1] * 2
+        mended = fragile.faults.pop()
+        assert (mended.worker, mended.restarts, mended.seed) == (1, restarts, seed)
+        assert str(mended) == f"{reason}; started anew with seed {seed} (restart {restarts})"
+        assert ("Traceback" in mended.reason) == (fault == RAISE)
+        obs, rewards, dones, _ = step(fragile, actions())
+        assert not dones.any() and rewards.tolist() == [1.0] * 4
+        assert obs[2:, 1].tolist() == [6.0, 6.0] and obs[2:, 2].tolist() == [1.0, 1.0]
+    assert not fragile.faults
+    assert [state["restarts"] for state in fragile.state_dicts()] == [0, 2]
+    for _ in range(FAULT_STEPS):  # after so long, a third one is no pattern
+        step(fragile, actions())
+    step(fragile, actions(r2=RAISE))
+    assert [fault.restarts for fault in fragile.faults] == [3]
+
+
+def test_a_worker_that_hangs_is_started_anew() -> None:
+    env = TaskVecEnv(Fragile, 2, 1, seed=3, spaces=SPACES, recover=True)
+    env.reset()
+    seen, *_ = step(env, actions(2))
+    env.timeout = 1.5
+    obs, rewards, dones, infos = step(env, actions(2, r0=HANG))
+    env.timeout = 300.0
+    assert dones.all() and (rewards == 0.0).all() and (obs[:, 1:3] == 0.0).all()
+    np.testing.assert_array_equal(infos[0]["terminal_observation"], seen[0])
+    assert env.faults[0].reason == "worker 0 gave no answer for 1.5 s"
+    obs, _, dones, _ = step(env, actions(2))
+    assert not dones.any() and (obs[:, 2] == 1.0).all()
+    env.close()
+
+
+def test_faults_that_come_back_are_raised(fragile: TaskVecEnv) -> None:
+    """The third within a short stretch, of whichever worker; then the states are still known."""
+    fragile.reset()
+    step(fragile, actions())
+    fragile.state_dicts()
+    step(fragile, actions(r0=RAISE))
+    step(fragile, actions(r3=DIE))
+    with pytest.raises(WorkerError) as caught:
+        step(fragile, actions(r1=RAISE))
+    message = str(caught.value)
+    assert message.startswith(
+        "3 faults of workers within 1000 steps; the last one: worker 0 failed:\nTraceback"
+    )
+    assert message.rstrip().endswith("ValueError: the ground is gone")
+    assert [(f.worker, f.restarts) for f in fragile.faults] == [(0, 1), (1, 1)]
+    # Worker 0 was at level 1 when it was last asked, worker 1 has taken one step since.
+    assert [state["level"] for state in fragile.state_dicts()] == [1, 2]
+    assert len(fragile.stats()) == 1
+
+
+def test_faults_between_steps(fragile: TaskVecEnv) -> None:
+    """Whatever is asked when a worker is found dead; and a resumed run knows of the restarts."""
+    fragile.reset()
+    obs, *_ = step(fragile, actions())
+    os.kill(fragile.worker_pids[0], signal.SIGKILL)
+    assert [state["level"] for state in fragile.state_dicts()] == [0, 1]
+    assert [sums["restarts"] for sums in fragile.stats()] == [2.0]
+    seen, rewards, dones, infos = step(fragile, actions())
+    assert dones.tolist() == [True, True, False, False]
+    assert rewards.tolist() == [0.0, 0.0, 1.0, 1.0]
+    np.testing.assert_array_equal(infos[1]["terminal_observation"], obs[1])
+    assert seen[:2, 1].tolist() == [0.0, 0.0]
+    os.kill(fragile.worker_pids[1], signal.SIGKILL)
+    obs = fragile.reset()
+    assert obs[:, 1].tolist() == [0.0, 0.0, 1.0, 1.0] and (obs[:, 2] == 0.0).all()
+    assert [(f.worker, f.restarts) for f in fragile.faults] == [(0, 1), (1, 1)]
+    states = json.loads(json.dumps(fragile.state_dicts()))
+    future = [fragile.reset(), step(fragile, actions())[0], fragile.reset()]
+    other = TaskVecEnv(Fragile, 4, 2, seed=3, spaces=SPACES)
+    other.load_state_dicts(states)
+    assert other.state_dicts() == states
+    again = [other.reset(), step(other, actions())[0], other.reset()]
+    np.testing.assert_array_equal(again, future)
+    other.close()
+
+
+# ------------------------------------------------------------------ robots
+
+
+def test_robots_that_blow_up_never_reach_the_learner() -> None:
+    """One that is far off ends alone; with a NaN or an infinity the world is built anew."""
+    env = TaskVecEnv(Fragile, 3, 1, seed=0, spaces=SPACES)
+    seed, count = worker_seed(0, 0), 2
+    env.reset()
+    for fault in (NAN_SEEN, NAN_EARNED, INFINITE, FAR):
+        seen, *_ = step(env, actions(3))
+        obs, rewards, dones, infos = step(env, actions(3, r1=fault))
+        assert rewards.tolist() == [1.0, 0.0, 1.0]
+        np.testing.assert_array_equal(infos[1]["terminal_observation"], seen[1])
+        level, steps = seen[0, 1] + 1, seen[0, 2] + 1
+        if fault == FAR:
+            assert dones.tolist() == [False, True, False]
+            assert obs[:, 2].tolist() == [steps, 0.0, steps]
+        else:
+            count += 1
+            assert dones.all() and (obs[:, 2] == 0.0).all()
+            for i in (0, 2):
+                assert infos[i]["terminal_observation"][:3].tolist() == [i, level, steps]
+        assert all(infos[i]["TimeLimit.truncated"] for i in np.flatnonzero(dones))
+        assert (obs[:, 1] == level).all() and (obs[:, 3] == drawn(seed, count)).all()
+    assert [sums["blow_ups"] for sums in (*env.stats(), *env.stats())] == [4.0, 0.0]
+    env.close()
+
+
+class Poisoned(LowLevelTask):
+    """In its eighth step, robot 1's motors give a torque that is not a number."""
+
+    steps = 0
+
+    def step(self, actions: Any) -> Any:
+        self.steps += 1
+        if self.steps == 8:
+            self.locomotion.world.strength[1] = np.nan
+        return super().step(actions)
+
+    def restart(self) -> None:
+        super().restart()
+        self.elapsed[:] = 0  # so that no episode ends here
+
+
+def make_poisoned(robots: int, seed: int) -> Poisoned:
+    return Poisoned(LowLevelConfig(physics=PhysicsConfig(substeps=4)), robots, seed)
+
+
+def test_a_blow_up_inside_bullet() -> None:
+    """A NaN in one robot leaves its neighbours without ground, even after its reset; so they
+    start anew with it, and stand again 25 steps later."""
+    probe = make_poisoned(1, 0)
+    env = TaskVecEnv(make_poisoned, 3, 1, 0, (probe.observation_space, probe.action_space))
+    env.reset()
+    still = np.zeros((3, 12), dtype=np.float32)
+    ends = []
+    for _ in range(32):
+        obs, rewards, dones, infos = step(env, still)
+        ends.append(int(dones.sum()))
+        assert np.isfinite(obs).all() and np.isfinite(rewards).all()
+        last = [infos[i]["terminal_observation"] for i in np.flatnonzero(dones)]
+        assert np.isfinite(last).all()
+    assert ends == [0] * 7 + [3] + [0] * 24
+    sums = env.stats()[0]
+    assert sums["blow_ups"] == 1.0 and np.isfinite(list(sums.values())).all()
+    height = probe.actor_dim + 6  # of the trunk against the standing height, times 10
+    assert (np.abs(obs[:, height]) < 0.5).all()
+    env.close()
+    probe.close()
+
+
+# ------------------------------------------------------------------ what is left behind
+
+PARENT = """
+import sys, time
+sys.path[:0] = {path!r}
+import test_faults as t
+if __name__ == "__main__":
+    env = t.TaskVecEnv(t.Fragile, 2, 2, seed=0, spaces=t.SPACES, recover=True)
+    env.reset()
+    env.step_async(t.actions(2, r1=t.HANG))
+    print("ready", flush=True)
+    time.sleep({seconds})
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev/shm")
+@pytest.mark.parametrize("killed", [True, False])
+def test_nothing_outlives_the_parent(killed: bool, tmp_path: Path) -> None:
+    """Neither an idle worker nor one that hangs, whether the parent is killed or just ends; each
+    holds the parent's output open."""
+    here = Path(__file__).resolve()
+    path, seconds = [str(here.parent), str(here.parents[1])], 1e6 if killed else 0.0
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT.format(path=path, seconds=seconds), encoding="utf-8")
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None and parent.stdout.readline() == "ready\n"
+    if killed:
+        parent.kill()
+    rest, _ = parent.communicate(timeout=300.0)
+    assert rest == "" and parent.returncode == (-signal.SIGKILL if killed else 0)
+    assert not list(Path("/dev/shm").glob(f"*-{parent.pid}-*"))
+
+
+def test_a_fault_in_one_line() -> None:
+    fault = Fault(1, "worker 1 failed:\nTraceback ...\nKeyError: 'x'\n", 2, 9)
+    assert str(fault) == "worker 1 failed: KeyError: 'x'; started anew with seed 9 (restart 2)"
