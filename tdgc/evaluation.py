@@ -16,7 +16,7 @@ import multiprocessing as mp
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +156,25 @@ def tile_of(seed: int, family: str, level: int, episode: int) -> Tile:
     return make_tile(family, level / MAX_LEVEL, rng)
 
 
-def run_cell(cell: Cell, low: Policy, driver: Driver, seed: int) -> list[Episode]:
+class Watcher(Protocol):
+    """Looks on while a batch runs; it must change nothing."""
+
+    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
+        """The robots stand at their starts; ``goal`` (M, 2) m in the world."""
+
+    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+        """After control step number ``step`` of the robots ``live`` (n,); ``outcome`` (M,) indexes
+        ``OUTCOMES`` and is -1 for those that go on."""
+
+
+def run_cell(
+    cell: Cell,
+    low: Policy,
+    driver: Driver,
+    seed: int,
+    watcher: Watcher | None = None,
+    visual: bool = False,
+) -> list[Episode]:
     """Run a batch of episodes to their ends.
 
     Args:
@@ -164,6 +182,8 @@ def run_cell(cell: Cell, low: Policy, driver: Driver, seed: int) -> list[Episode
         low: the frozen low level.
         driver: what commands it.
         seed: of the evaluation's tiles.
+        watcher: who looks on.
+        visual: keep what pictures of the ground need.
 
     Returns:
         An episode each, in order.
@@ -175,7 +195,7 @@ def run_cell(cell: Cell, low: Policy, driver: Driver, seed: int) -> list[Episode
     for k in range(m):
         field.place(k, 0, tile_of(seed, cell.family, cell.level, cell.first + k))
     field.heights.setflags(write=False)  # for a faster world
-    loco = Locomotion(m, config.robot, physics_of(config, condition), field, config.gyro)
+    loco = Locomotion(m, config.robot, physics_of(config, condition), field, config.gyro, visual)
     world = loco.world
     origin = field.origin(rows, 0)
     start, goal = field.starts[:, 0], field.goals[:, 0] + origin
@@ -186,6 +206,8 @@ def run_cell(cell: Cell, low: Policy, driver: Driver, seed: int) -> list[Episode
     world.set_dynamics(rows, loco.friction, loco.payload)
     loco.place(rows, start[:, :2] + origin, start[:, 2], np.zeros(m))
     driver.begin(loco, goal, cell.family)
+    if watcher is not None:
+        watcher.begin(cell, loco, field, goal)
 
     dt = config.physics.control_dt
     horizon = round(HORIZON / dt)
@@ -223,6 +245,8 @@ def run_cell(cell: Cell, low: Policy, driver: Driver, seed: int) -> list[Episode
             ended[ended < 0] = -1 if step + 1 < horizon else OUTCOMES.index("timeout")
             done = live[ended[live] >= 0]
             outcome[done] = ended[done]
+            if watcher is not None:
+                watcher.step(step, live, outcome)
             if done.size:
                 world.retire(done)  # whose rows of the state stay as they are
             if (outcome >= 0).all():

@@ -82,6 +82,11 @@ _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap
 # Crossing: trot climbs best, and with all gaits alike the worst one decides how far levels rise.
 _FREE_GAITS = (0.2, 0.2, 0.25, 0.35)
 _CROSSING_GAITS = (0.6, 0.1, 0.15, 0.15)
+# Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet land
+# on the same lines, so that a trench fits between two of them. Drawn evenly, such commands are too
+# rare: of 0.86 m/s at 2 Hz the robot did 0.5.
+_LEAP_SHARE = 0.15
+_LEAP: dict[str, tuple[float, float]] = {"vx": (0.7, 1.0), "frequency": (2.0, 2.75)}
 
 # Command curriculum: a gait's velocity range grows when it tracks well over an evaluation batch.
 _GROWTH = 0.05
@@ -365,6 +370,10 @@ class LowLevelTask:
         gait = np.sum(rng.uniform(size=(n, 1)) > np.cumsum(shares, axis=1)[:, :-1], axis=1)
         low, high = self._bounds(index)
         values = rng.uniform(low, high)
+        leap = ~self._crossing[index] & (rng.uniform(size=n) < _LEAP_SHARE)
+        gait[leap] = GAITS.index("pronk")
+        for name, (slowest, fastest) in _LEAP.items():
+            values[leap, INDEX[name]] = rng.uniform(slowest, fastest, int(leap.sum()))
         values[:, :3] *= self.command_share[gait][:, None]
         # A tenth stands: stepping on the spot is asked for at every goal.
         values[rng.uniform(size=n) < 0.1, :3] = 0.0
