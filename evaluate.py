@@ -4,6 +4,10 @@
 python evaluate.py --levels 6-10
 python evaluate.py --tracking
 python evaluate.py --policies gp --families stair,gap --levels 8 --episodes 20 --out runs/eval
+python evaluate.py --trace failed
+python evaluate.py --video 2
+python evaluate.py --gui watch --families stair --levels 6
+python evaluate.py --set decoder.vx.high=0.6 --set safety.max_tilt=0.5
 """
 
 from __future__ import annotations
@@ -19,8 +23,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tdgc import plots
+from tdgc import diagnosis, film, gui, plots, tuning
 from tdgc.config import LowLevelConfig
+from tdgc.diagnosis import Diagnosis, diagnose
 from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
 from tdgc.evaluation import (
     CONDITIONS,
@@ -34,9 +39,14 @@ from tdgc.evaluation import (
 )
 from tdgc.high_env import PRETRAINED, load_low
 from tdgc.policies import Policy
+from tdgc.recording import Recorder, Recording, Together
 from tdgc.terrain import ALL_FAMILIES, FAMILIES, OOD_LEVELS
+from tdgc.trace import Selection, Tracer, check_installed, write
+from tdgc.tuning import TunedDriver, Tuning
+from tdgc.world import WindowError
 
 POLICIES = ("tdgc", "gp")
+TUNED = "tdgc-tuned"  # beside "tdgc" where there is a tuning
 SHIPPED_HIGH = PRETRAINED / "high"
 
 
@@ -56,6 +66,38 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low-level policy")
     parser.add_argument("--high", type=Path, help="high-level policy (the shipped one)")
     parser.add_argument("--tracking", action="store_true", help="the low level alone, on the plane")
+    parser.add_argument(
+        "--trace",
+        metavar="WHICH",
+        help="trace decisions and diagnose failures; write the traces of all episodes, of those "
+        "that failed, or of the first N of each cell: all, failed or N",
+    )
+    parser.add_argument("--tune", type=Path, metavar="FILE", help="tuning to compare with none")
+    parser.add_argument(
+        "--set",
+        dest="assignments",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="change the tuning, e.g. decoder.vx.high=0.6; may be repeated",
+    )
+    parser.add_argument(
+        "--video",
+        type=int,
+        nargs="?",
+        const=1,
+        default=0,
+        metavar="N",
+        help="films, sheets and strips of the first N episodes of each cell (1)",
+    )
+    parser.add_argument(
+        "--gui",
+        nargs="?",
+        const="drive",
+        choices=gui.MODES,
+        help="Bullet's window instead of a table, on the first tile of the first family and level: "
+        "drive the low level with sliders (drive), or watch the first policy decide (watch)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--out", type=Path, default=Path("runs/evaluation"), help="results folder")
@@ -96,14 +138,32 @@ def choose_levels(text: str) -> list[int]:
     return levels
 
 
-def make_drivers(
-    names: list[str], high: Path | None, low: Policy, config: LowLevelConfig
-) -> dict[str, Driver]:
-    """What drives the robots of each policy asked for.
+def load_tuning(args: argparse.Namespace) -> Tuning | None:
+    """The tuning that ``--tune`` and ``--set`` ask for, None without either.
 
     Raises:
-        ValueError: no high level, or one that does not fit the low level.
+        ValueError: one that cannot be read.
     """
+    if args.tune is None and not args.assignments:
+        return None
+    return tuning.load(args.tune, args.assignments)
+
+
+def make_drivers(
+    names: list[str],
+    high: Path | None,
+    low: Policy,
+    config: LowLevelConfig,
+    tuned: Tuning | None = None,
+) -> dict[str, Driver]:
+    """What drives the robots of each policy asked for, and of the tuned one after ``tdgc``.
+
+    Raises:
+        ValueError: no high level, one that does not fit the low level, or a tuning that fits
+            neither.
+    """
+    if tuned is not None and "tdgc" not in names:
+        raise ValueError("--tune and --set change tdgc, which is not among the policies")
     drivers: dict[str, Driver] = {}
     for name in names:
         if name == "gp":
@@ -111,12 +171,36 @@ def make_drivers(
         elif high is None:
             raise ValueError("no high level is shipped; give one with --high, or use --policies gp")
         else:
-            drivers[name] = HierarchyDriver(*load_high(high, low, config))
+            pair = load_high(high, low, config)
+            drivers[name] = HierarchyDriver(*pair)
+            if tuned is not None:
+                drivers[TUNED] = TunedDriver(*pair, config, tuned)
     return drivers
 
 
-def run_one(cell: Cell, low: Policy, drivers: Mapping[str, Driver], seed: int) -> list[Episode]:
-    return run_cell(cell, low, drivers[cell.policy], seed)
+def run_one(
+    cell: Cell,
+    low: Policy,
+    drivers: Mapping[str, Driver],
+    seed: int,
+    filmed: int,
+    traced: Selection | None,
+    folder: Path,
+) -> tuple[list[Episode], list[Recording], list[Diagnosis]]:
+    """A batch, with recordings of the cell's first ``filmed`` episodes; with ``traced`` also its
+    diagnoses, and the chosen traces into ``folder``."""
+    driver = drivers[cell.policy]
+    recorder = Recorder(driver, seed, filmed)
+    if traced is None:
+        return run_cell(cell, low, driver, seed, recorder), recorder.recordings(), []
+    tracer = Tracer(driver, seed)
+    episodes = run_cell(cell, low, driver, seed, Together([tracer, recorder]))
+    traces = tracer.traces()
+    for trace in traces:
+        if traced.includes(trace):
+            write(trace, folder)
+    diagnoses = [diagnose(trace) for trace in traces if trace.outcome != "reached"]
+    return episodes, recorder.recordings(), diagnoses
 
 
 def print_table(summary: dict[str, Any]) -> None:
@@ -147,14 +231,59 @@ def run_tracking(low: Policy, args: argparse.Namespace) -> None:
     print(f"{result['falls_per_10_min']:.2f} falls in 10 minutes ({result['minutes']:.1f} walked)")
 
 
+def print_effect(effect: dict[str, Any]) -> None:
+    """What a tuning changed: success, speed and energy beside those without it."""
+    for condition, found in effect.items():
+        print(f"\nwhat the tuning changes, {condition}")
+        print("policy       success       speed      energy")
+        for policy in ("tdgc", TUNED):
+            rates = found[policy]
+            energy = rates["energy_per_metre"]
+            cost = "-" if energy is None else f"{energy:.0f} J/m"
+            speed = f"{rates['mean_speed']:.2f} m/s"
+            print(f"{policy:<12}{100 * rates['rate']:6.1f} %{speed:>12}{cost:>12}")
+        print(f"of {found['tdgc']['n']} episodes {found['gained']} gained, {found['lost']} lost")
+
+
+def prepare(folder: Path, traced: bool, filmed: bool) -> None:
+    """Make room for results: what an earlier run left and this one may not write goes away."""
+    films = (old for kind in ("film", "sheet", "strip") for old in folder.glob(f"films/{kind}_*"))
+    tables = (folder / "diagnosis.csv", folder / "tuning.json")
+    for old in (*folder.glob("traces/*.parquet"), *films, *tables):
+        old.unlink(missing_ok=True)
+    if filmed:
+        (folder / "films").mkdir(exist_ok=True)
+    if traced:
+        (folder / "traces").mkdir(exist_ok=True)
+
+
 def run_table(
-    low: Policy, drivers: Mapping[str, Driver], cells: list[Cell], args: argparse.Namespace
-) -> None:
-    work = functools.partial(run_one, low=low, drivers=drivers, seed=args.seed)
+    low: Policy,
+    drivers: Mapping[str, Driver],
+    cells: list[Cell],
+    args: argparse.Namespace,
+    traced: Selection | None = None,
+    tuned: Tuning | None = None,
+) -> int:
+    """Run all cells and write everything; the exit status, 1 where a film is missing."""
+    folder = args.out / "traces"
+    work = functools.partial(
+        run_one,
+        low=low,
+        drivers=drivers,
+        seed=args.seed,
+        filmed=args.video,
+        traced=traced,
+        folder=folder,
+    )
     episodes: list[Episode] = []
+    recordings: list[Recording] = []
+    diagnoses: list[Diagnosis] = []
     with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
-        for rows in spread(work, cells, args.workers):
+        for rows, recorded, failures in spread(work, cells, args.workers):
             episodes += rows
+            recordings += recorded
+            diagnoses += failures
             bar.update(len(rows))
     summary = write_results(args.out, episodes)
     plots.success_by_level(args.out / "summary.json", args.out / "success.png")
@@ -162,7 +291,37 @@ def run_table(
     plots.headings(args.out, args.out / "headings.png")
     plots.trajectories(args.out, args.out / "trajectories.png")
     print_table(summary)
+    if traced is not None:
+        diagnosis.write(diagnoses, args.out / "diagnosis.csv")
+        print(f"\n{diagnosis.describe(diagnoses, episodes)}")
+    if tuned is not None:
+        effect = tuning.compare(episodes, "tdgc", TUNED)
+        result = {"tuning": tuning.record(tuned), "effect": effect}
+        (args.out / "tuning.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
+        print_effect(effect)
     print(f"\ntables and figures are in {args.out}")
+    if not recordings:
+        return 0
+    problems = film.produce(recordings, args.out / "films", args.workers)
+    for problem in problems:
+        print(f"evaluate.py: {problem}", file=sys.stderr)
+    return 1 if problems else 0
+
+
+def run_gui(
+    low: Policy, drivers: Mapping[str, Driver], cell: Cell, args: argparse.Namespace
+) -> int:
+    try:
+        if args.gui == "drive":
+            gui.drive(low, cell, args.seed)
+        else:
+            gui.watch(low, drivers[cell.policy], cell, args.seed)
+    except WindowError as error:
+        print(f"evaluate.py: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        pass  # as good an end as closing the window
+    return 0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -180,16 +339,34 @@ def main(arguments: list[str] | None = None) -> int:
                 raise ValueError(f"{flag} must be at least 1, not {value}")
         if not 0 <= args.seed < 2**32:
             raise ValueError(f"--seed must lie in [0, 2**32), not {args.seed}")
+        traced = Selection.parse(args.trace) if args.trace is not None else None
+        if traced is not None:
+            check_installed()
+        tuned = load_tuning(args)
+        if not 0 <= args.video <= args.episodes:
+            raise ValueError(f"--video must lie in [0, --episodes], not {args.video}")
+        if args.gui is not None and (args.tracking or args.video or traced is not None):
+            raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
+        if args.tracking and args.video:
+            raise ValueError("--tracking has no episodes to film: no --video")
+        if args.tracking and (traced is not None or tuned is not None):
+            raise ValueError("--tracking is of the low level alone: no --trace, --tune or --set")
         low, config = load_low(args.low)
-        drivers = {} if args.tracking else make_drivers(names, high, low, config)
+        drivers = {} if args.tracking else make_drivers(names, high, low, config, tuned)
         args.out.mkdir(parents=True, exist_ok=True)
+        if not args.tracking and args.gui is None:
+            prepare(args.out, traced is not None, args.video > 0)
     except (ValueError, OSError) as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
+    if args.gui is not None:
+        first = Cell(next(iter(drivers)), "nominal", families[0], levels[0], 0, 1)
+        return run_gui(low, drivers, first, args)
     if args.tracking:
         run_tracking(low, args)
     else:
-        run_table(low, drivers, plan(names, conditions, families, levels, args.episodes), args)
+        cells = plan(list(drivers), conditions, families, levels, args.episodes)
+        return run_table(low, drivers, cells, args, traced, tuned)
     return 0
 
 

@@ -12,7 +12,7 @@ import argparse
 import functools
 import math
 import sys
-from typing import Any
+from typing import Any, cast
 
 import torch as th
 
@@ -39,7 +39,7 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
     command[INDEX["vx"]] = config.start_speed
     decoder = CommandDecoder(config.env.commands, config.env.action_limit)
     with th.no_grad():
-        policy.action_net.bias.copy_(th.from_numpy(decoder.encode(command)))
+        policy.action_net.get_parameter("bias").copy_(th.from_numpy(decoder.encode(command)))
         policy.log_std[-1] = math.log(config.ppo.initial_gait_std)
 
 
@@ -81,7 +81,7 @@ def build(
         seed=config.seed,
         device=device,
     )
-    start_walking(model.policy, config)
+    start_walking(cast(FastRecurrentPolicy, model.policy), config)
     return model, env
 
 

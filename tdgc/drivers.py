@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tdgc import policies
 from tdgc.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
@@ -18,7 +19,17 @@ from tdgc.robot import Array, wrap_angle
 
 
 class Driver(Protocol):
-    """Drives robots to their goals, step by step."""
+    """Drives robots to their goals, step by step.
+
+    Attributes:
+        config: the MDP of its decisions; cues "none" where it looks at none.
+        bounds: what its commands stay within.
+        action: (M, 13) of the last decision as the policy gave it; None where none is decoded.
+    """
+
+    config: HighLevelConfig
+    bounds: CommandRanges
+    action: NDArray[np.floating] | None
 
     def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
         """New episodes for all robots of ``loco``; ``goal`` (M, 2) m in the world."""
@@ -51,10 +62,13 @@ class GoToGoal:
 
 
 class BaselineDriver:
-    """Drives robots by ``GoToGoal``; it knows no families."""
+    """Drives robots by ``GoToGoal``, anew at every control step; it knows no families."""
 
     def __init__(self, law: GoToGoal | None = None) -> None:
         self.law = law or GoToGoal()
+        self.config = HighLevelConfig(cues="none")
+        self.bounds = CommandRanges()
+        self.action: NDArray[np.floating] | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
         self._loco, self._goal = loco, goal
@@ -78,11 +92,13 @@ class HierarchyDriver:
     """
 
     def __init__(self, high: Policy, config: HighLevelConfig) -> None:
-        self._high, self._config = high, config
+        self._high, self.config = high, config
+        self.bounds = config.commands
+        self.action: NDArray[np.floating] | None = None
         self._decoder = CommandDecoder(config.commands, config.action_limit)
 
     def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
-        m, config = loco.num_robots, self._config
+        m, config = loco.num_robots, self.config
         self._loco, self._goal = loco, goal
         seen = SEMANTIC.index(family if family in SEMANTIC else "unknown")
         self._families = np.full(m, seen)
@@ -90,21 +106,21 @@ class HierarchyDriver:
             config.episode_seconds / (config.decimation * loco.physics.control_dt)
         )
         self._state: policies.State | None = None
-        self._action = np.zeros((m, NUM_ACTIONS))
+        self._last = np.zeros((m, NUM_ACTIONS))
 
     def command(self, step: int) -> Array:
-        decision, held = divmod(step, self._config.decimation)
+        decision, held = divmod(step, self.config.decimation)
         if held == 0:
             observation = observe_high(
                 self._loco,
                 self._goal,
                 np.full(self._loco.num_robots, decision / self._horizon),
-                self._action,
+                self._last,
                 self._families,
-                self._config.cues,
+                self.config.cues,
             )
             action, self._state = self._high.predict(observation, self._state)
-            self._action = self._decoder.normalise(action)
+            self.action, self._last = action, self._decoder.normalise(action)
             self._command = self._decoder.decode(action)
         return self._command
 

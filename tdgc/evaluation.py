@@ -29,7 +29,7 @@ from tdgc.locomotion import Locomotion
 from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE, is_fallen
 from tdgc.policies import Policy
 from tdgc.rewards import CONTACT_FORCE
-from tdgc.robot import NUM_JOINTS, Array
+from tdgc.robot import NUM_JOINTS, Array, RobotState
 from tdgc.terrain import ALL_FAMILIES, EVAL_STREAM, MAX_LEVEL, Tile, TileField, make_tile, tile_rng
 from tdgc.vec import one_blas_thread
 
@@ -91,6 +91,7 @@ class Episode:
     """A row of episodes.csv, and where the robot went.
 
     Attributes:
+        energy_j: J, mechanical: ``joint_power`` at the end of each control step, times its length.
         shares: of its time in each gait of ``GAITS``, as commanded.
         goal: (2,) m, in the tile's frame.
         track: (n, 3) x, y in m in the tile's frame and heading in rad, every ``POSE_SECONDS`` from
@@ -106,6 +107,7 @@ class Episode:
     outcome: str
     time_s: float
     path_m: float
+    energy_j: float
     shares: tuple[float, ...]
     goal: Array
     track: Array
@@ -116,6 +118,7 @@ class Episode:
         names = [f.name for f in dataclasses.fields(self) if f.name not in beside]
         row = {name: getattr(self, name) for name in names}
         row["time_s"], row["path_m"] = round(self.time_s, 2), round(self.path_m, 3)
+        row["energy_j"] = round(self.energy_j, 1)
         return row | {f"share_{g}": round(x, 4) for g, x in zip(GAITS, self.shares, strict=True)}
 
 
@@ -154,6 +157,11 @@ def tile_of(seed: int, family: str, level: int, episode: int) -> Tile:
     """The tile of one episode, with its start and goal: the same for every policy."""
     rng = tile_rng(seed, family, level, episode, EVAL_STREAM)
     return make_tile(family, level / MAX_LEVEL, rng)
+
+
+def joint_power(state: RobotState) -> Array:
+    """Mechanical power that the joints give or take, (M,) W: no motor wins back what it brakes."""
+    return np.asarray(np.abs(state.torque * state.qd).sum(axis=1))
 
 
 class Watcher(Protocol):
@@ -216,6 +224,7 @@ def run_cell(
     outcome = np.full(m, -1)
     steps = np.zeros(m, dtype=int)
     path = np.zeros(m)
+    energy = np.zeros(m)
     shares = np.zeros((m, len(GAITS)))
     actions = np.zeros((m, NUM_JOINTS))
     poses: list[Array] = []
@@ -239,6 +248,7 @@ def run_cell(
                 # Its fellows in Bullet would fall through the ground from now on.
                 raise FloatingPointError(f"{cell}: a robot's position is not finite")
             path[live] += np.linalg.norm(world.state.position[live, :2] - before[live], axis=1)
+            energy[live] += dt * joint_power(world.state)[live]
             shares[live, gait_index(loco.command[live])] += 1.0
             steps[live] = step + 1
             ended = classify(loco, goal, field)
@@ -266,6 +276,7 @@ def run_cell(
             OUTCOMES[outcome[k]],
             steps[k] * dt,
             path[k],
+            energy[k],
             tuple(shares[k] / steps[k]),
             field.goals[k, 0],
             np.array([p[k] for p in (*poses[: kept[k]], poses[-1])]),
@@ -353,7 +364,8 @@ def wilson_interval(reached: int, n: int, z: float = 1.959964) -> tuple[float, f
     return max(0.0, float(centre - half)), min(1.0, float(centre + half))
 
 
-def _rate(rows: Sequence[Episode]) -> dict[str, float]:
+def success(rows: Sequence[Episode]) -> dict[str, float]:
+    """How many episodes reached the goal: n, reached, rate, and its interval ci_low, ci_high."""
     n, reached = len(rows), sum(e.outcome == "reached" for e in rows)
     low, high = wilson_interval(reached, n)
     return {"n": n, "reached": reached, "rate": reached / n, "ci_low": low, "ci_high": high}
@@ -376,9 +388,9 @@ def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:
                 rows = [e for level in levels.values() for e in level]
                 everything += rows
                 for level, some in levels.items():
-                    levels[level] = _rate(some)
-                levels["mean"] = _rate(rows)
-            families["mean"] = _rate(everything)
+                    levels[level] = success(some)
+                levels["mean"] = success(rows)
+            families["mean"] = success(everything)
     return tree
 
 

@@ -46,7 +46,7 @@ from tdgc.commands import (
     default_command,
     observed_command,
 )
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
 from tdgc.drivers import load_high
 from tdgc.gaits import FEET, GAIT_TABLE, GAITS
 from tdgc.high_env import (
@@ -62,7 +62,20 @@ from tdgc.high_env import (
 from tdgc.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, SPEED_SCALE
 from tdgc.low_env import is_fallen
 from tdgc.policies import Policy
-from tdgc.robot import JOINTS, NUM_JOINTS, Array, joint_targets, nominal_pose
+from tdgc.robot import (
+    ABDUCTION,
+    CALF,
+    HIGHEST_FOOT,
+    HIPS_XY,
+    JOINT_LIMITS,
+    JOINTS,
+    NUM_JOINTS,
+    THIGH,
+    Array,
+    foot_kinematics,
+    joint_targets,
+    nominal_pose,
+)
 
 #: Formats and the endings of their files.
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
@@ -143,14 +156,54 @@ class Actor(nn.Module):
         return x.clamp(self.low, self.high)
 
 
-def clock_signal(clock: Tensor, command: Tensor) -> Tensor:
-    """sin(2 pi phase) of each foot, as ``PhaseClock.signal``: (1,), (15,) -> (4,)."""
+def foot_phases(clock: Tensor, command: Tensor) -> Tensor:
+    """Warped phase of each foot, as ``gaits.foot_phases``: (1,), (15,) -> (4,)."""
     phase, offset, bound = command[12:].unbind()
     duty = command[INDEX["duration"]]
     raw = clock + th.stack([phase + offset + bound, offset, bound, phase])
     raw = raw - raw.floor()
     swing = 0.5 + (raw - duty) * (0.5 / (1.0 - duty))
-    return th.sin(_TURN * th.where(raw < duty, raw * (0.5 / duty), swing))
+    return th.where(raw < duty, raw * (0.5 / duty), swing)
+
+
+def clock_signal(clock: Tensor, command: Tensor) -> Tensor:
+    """sin(2 pi phase) of each foot, as ``PhaseClock.signal``: (1,), (15,) -> (4,)."""
+    return th.sin(_TURN * foot_phases(clock, command))
+
+
+class Pose(nn.Module):
+    """q0, as ``Locomotion.pose``: (1,), (15,) -> (12,) rad."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        super().__init__()
+        nominal = nominal_pose(robot)
+        self.follows, self.nominal = robot.commanded_pose, _constant(nominal)
+        standing = foot_kinematics(nominal[None], np.zeros((1, NUM_JOINTS)))[0][0]
+        hips = np.pad(HIPS_XY, ((0, 0), (0, 1)))
+        self.feet, self.default = _constant(standing - hips), _constant(default_command())
+        self.front, self.side = (_constant(np.sign(HIPS_XY[:, i])) for i in (0, 1))
+        self.lowest, self.highest = (float(x) for x in JOINT_LIMITS[2])
+
+    def forward(self, clock: Tensor, command: Tensor) -> Tensor:
+        if not self.follows:
+            return self.nominal
+        swing = (2.0 * foot_phases(clock, command) - 1.0).clamp(0.0, 1.0)
+        raised = th.sin(0.5 * _TURN * swing)
+        change = command - self.default
+        x = self.feet[:, 0] + 0.5 * change[INDEX["stance_length"]] * self.front
+        y = self.feet[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
+        z = self.feet[:, 2] - change[INDEX["body_height"]]
+        z = (z + change[INDEX["swing_height"]] * raised).clamp(max=HIGHEST_FOOT)
+        out = ABDUCTION * self.side
+        down = (y * y + z * z - out * out).clamp(min=0.0).sqrt()
+        bend = (x * x + down * down - THIGH * THIGH - CALF * CALF) / (2.0 * THIGH * CALF)
+        # ONNX Runtime has inverse functions of float32 alone, and no arctan2.
+        calf = (-th.acos(bend.clamp(-1.0, 1.0).float())).double()
+        calf = calf.clamp(self.lowest, self.highest)
+        lean = CALF * th.sin(calf) / (THIGH + CALF * th.cos(calf))
+        hip = th.atan(((out * z + down * y) / (out * y - down * z)).float()).double()
+        thigh = (th.atan((-x / down).float()) - th.atan(lean.float())).double()
+        return th.stack([hip, thigh, calf], 1).flatten()
 
 
 class LowLevel(nn.Module):
@@ -166,10 +219,10 @@ class LowLevel(nn.Module):
         robot = config.robot
         self.dt = _constant(config.physics.control_dt)
         self.limit = _constant(robot.action_limit)
+        self.pose = Pose(robot)
         # These maps are affine, so their values at 0 and at 1 say all.
-        self.nominal = _constant(nominal_pose(robot))
-        furthest = joint_targets(robot, np.full((1, NUM_JOINTS), robot.action_limit))[0]
-        self.joint_scale = _constant((furthest - nominal_pose(robot)) / robot.action_limit)
+        ones = np.full((1, NUM_JOINTS), robot.action_limit)
+        self.joint_scale = _constant(joint_targets(robot, 0.0 * ones, ones)[0] / robot.action_limit)
         zero = observed_command(np.zeros(NUM_COMMANDS))
         self.command_zero = _constant(zero)
         self.command_gain = _constant(observed_command(np.ones(NUM_COMMANDS)) - zero)
@@ -192,9 +245,10 @@ class LowLevel(nn.Module):
         """``inputs`` -> ``outputs``."""
         x = _by_name(self.inputs, values)
         command, clock = x["commands"], x["clock"]
+        pose = self.pose(clock, command)
         parts = [
             x["gravity"],
-            x["joint_angles"] - self.nominal,
+            x["joint_angles"] - pose,
             _SPEED_UNIT * x["joint_speeds"],
             x["last_action"],
             x["action_before"],
@@ -206,7 +260,7 @@ class LowLevel(nn.Module):
             parts.append(_GYRO_SCALE * x["gyro"])
         action = self.actor(th.cat(parts).float()).double().clamp(-self.limit, self.limit)
         clock = clock + self.dt * command[INDEX["frequency"]]
-        return action, self.nominal + self.joint_scale * action, clock - clock.floor()
+        return action, pose + self.joint_scale * action, clock - clock.floor()
 
     def _gait(self, command: Tensor) -> Tensor:
         """Index of the gait as a share of the last one's, as the observation has it: (1,)."""
@@ -566,7 +620,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
             task.elapsed += 1
             for k in range(config.decimation):
                 action = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
-                targets = joint_targets(loco.robot, action.astype(np.float64))
+                targets = joint_targets(loco.robot, loco.pose(), action.astype(np.float64))
                 step = walk(_sense(task) | {"commands": made["commands"]})
                 seconds.append(walk.seconds + (decide.seconds if k == 0 else 0.0))
                 differences += [step["action"] - action[0], step["joint_targets"] - targets[0]]

@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 
 from tdgc import policies, rewards
 from tdgc.commands import NUM_ACTIONS, CommandDecoder, gait_index
-from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig, from_dict
+from tdgc.config import (
+    ConfigError,
+    HighLevelConfig,
+    HighRewardConfig,
+    LowLevelConfig,
+    from_dict,
+)
 from tdgc.curriculum import Curriculum
 from tdgc.gaits import GAITS
 from tdgc.locomotion import SPEED_SCALE, Locomotion
-from tdgc.low_env import GOAL_RADIUS, TILE_CROP, TaskEnv, is_fallen
+from tdgc.low_env import GOAL_RADIUS, TaskEnv, is_fallen
 from tdgc.policies import Policy
 from tdgc.robot import NUM_JOINTS, Array, wrap_angle
-from tdgc.terrain import (
-    FAMILIES,
-    MAX_LEVEL,
-    TRAIN_STREAM,
-    TileField,
-    draw_start_goal,
-    make_tile,
-    tile_rng,
-)
+from tdgc.state import State, copies, fill
+from tdgc.terrain import FAMILIES, draw_start_goal
+from tdgc.tiles import TrainingTiles
 from tdgc.world import World
 
 #: Where the shipped policies are.
@@ -40,10 +40,10 @@ PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 _GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
 _PROBE_RANGE = 0.5  # m, deeper and higher looks the same
 
-#: The sparse geometric cue: 32 heights in the heading frame, denser where the feet come next.
-PROBES: Array = np.array(
-    [(x, y) for x in (-0.2, 0.1, 0.3, 0.5, 0.7, 0.9, 1.2, 1.6) for y in (0.3, 0.1, -0.1, -0.3)]
-)
+#: The sparse geometric cue: 32 heights in the heading frame, from a hind foot to three strides
+#: ahead, staggered over four lines: an edge across the way is found to 5 cm, and a pillar on it,
+#: 20 cm wide at least, meets a probe.
+PROBES: Array = np.array([(0.05 * i - 0.25, (0.1, -0.3, 0.3, -0.1)[i % 4]) for i in range(32)])
 #: The semantic cue: one-hot over the families, and one place for "unknown".
 SEMANTIC = (*FAMILIES, "unknown")
 
@@ -114,6 +114,51 @@ def observe_high(
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 
+def command_share(commands: Array, decoder: CommandDecoder) -> Array:
+    """Commands (..., 15) as shares of the decoder's ranges, so that differences have one scale."""
+    span = np.where(decoder.high > decoder.low, decoder.high - decoder.low, 1)
+    return np.asarray((commands - decoder.low) / span)
+
+
+def high_step(
+    loco: Locomotion,
+    goal: Array,
+    time_share: Array | float,
+    actions: Array,
+    shares: Array,
+    force: Array,
+    config: HighRewardConfig,
+) -> rewards.HighStep:
+    """What the reward terms look at, after a decision was carried out.
+
+    Args:
+        loco: the robots.
+        goal: (M, 2) m in the world.
+        time_share: (M,) or one for all, t / T_max.
+        actions: (2, M, 13) of this decision and the one before, normalised.
+        shares: (3, M, 15) ``command_share`` of this decision and the two before.
+        force: (M, 5) N, largest since the decision: the trunk, and each leg above the foot.
+        config: weights and constants.
+    """
+    state = loco.world.state
+    offset = goal - state.position[:, :2]
+    x, y = state.position[:, 0], state.position[:, 1]
+    return rewards.HighStep(
+        distance=np.linalg.norm(offset, axis=1),
+        heading_error=np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw,
+        time_share=np.broadcast_to(time_share, x.shape),
+        lin_vel=state.lin_vel,
+        ang_vel=state.ang_vel,
+        joint_speed=state.qd,
+        base_height=state.position[:, 2] - loco.world.support_height(x, y),
+        standing_height=loco.robot.base_height,
+        actions=actions,
+        commands=shares,
+        contact_forces=force,
+        config=config,
+    )
+
+
 def check_pair(high: HighLevelConfig, low: LowLevelConfig) -> None:
     """Refuse decoder bounds that the low level was not trained on.
 
@@ -173,15 +218,14 @@ class NavigationTask:
         check_pair(config, self.low_config)
         self.decoder = CommandDecoder(config.commands, config.action_limit)
         self.rng = np.random.default_rng(seed)
-        self._seed, self._tiles_drawn = seed, 0
         self.step_seconds = config.decimation * self.low_config.physics.control_dt
         self.horizon = round(config.episode_seconds / self.step_seconds)
         self._hold = round(config.hold_seconds / self.step_seconds)
         self.family = np.arange(m) % len(config.families)
         first = np.arange(m) // len(config.families) % config.first_levels
         self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, first)
-        self.field = TileField((m, 1), crop=TILE_CROP)
-        self._drawn_level = np.full(m, -1)
+        self.tiles = TrainingTiles([config.families[f] for f in self.family], seed)
+        self.field = self.tiles.field
         self.locomotion = self._build_locomotion()
         self._origin = self.field.origin(np.arange(m), 0)
         self.goal = np.zeros((m, 2))
@@ -198,27 +242,18 @@ class NavigationTask:
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
     def _build_locomotion(self) -> Locomotion:
-        self._draw_tiles(np.flatnonzero(self._drawn_level != self.curriculum.levels))
+        self.tiles.draw(np.arange(self.num_robots), self.curriculum.levels)
         c = self.low_config
         return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro, self._visual)
-
-    def _draw_tiles(self, index: NDArray[np.integer]) -> None:
-        for i in index:
-            family, level = self.config.families[self.family[i]], int(self.curriculum.levels[i])
-            rng = tile_rng(self._seed, family, level, self._tiles_drawn, TRAIN_STREAM)
-            self._tiles_drawn += 1
-            self.field.place(int(i), 0, make_tile(family, level / MAX_LEVEL, rng))
-            self._drawn_level[i] = level
 
     # ------------------------------------------------------------------ episodes
 
     def reset(self, index: NDArray[np.integer]) -> None:
-        """Start new episodes for the robots ``index`` (n,), on fresh tiles after a new level."""
+        """Start new episodes for the robots ``index`` (n,)."""
         n, rng = len(index), self.rng
-        stale = index[self._drawn_level[index] != self.curriculum.levels[index]]
-        if stale.size:
-            self._draw_tiles(stale)
-            self.locomotion.world.upload_terrain(stale)
+        changed = self.tiles.begin(index, self.curriculum.levels)
+        if changed.size:
+            self.locomotion.world.upload_terrain(changed)
         starts, goals = draw_start_goal(rng, (n,))
         self.goal[index] = goals + self._origin[index]
         self.elapsed[index] = 0
@@ -228,7 +263,8 @@ class NavigationTask:
             self.locomotion.randomise(index, self.config.randomisation, rng, width)
             self._schedule_push(index)
         self._actions[:, index] = 0.0
-        self._commands[:, index] = self._share(self.decoder.decode(np.zeros(NUM_ACTIONS)))
+        middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
+        self._commands[:, index] = command_share(middle, self.decoder)
         self.locomotion.place(
             index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
         )
@@ -237,17 +273,9 @@ class NavigationTask:
         """How wide each robot's disturbances are: they grow with its level."""
         return self.curriculum.levels / max(self.config.levels - 1, 1)
 
-    def _share(self, commands: Array) -> Array:
-        """Commands as shares of the decoder's ranges, so that their differences have one scale."""
-        span = np.where(
-            self.decoder.high > self.decoder.low, self.decoder.high - self.decoder.low, 1
-        )
-        return np.asarray((commands - self.decoder.low) / span)
-
     def restart(self) -> None:
         """End every episode, draw new tiles and build the world anew (see ``LowLevelTask``)."""
         self.locomotion.world.close()
-        self._drawn_level[:] = -1
         self.locomotion = self._build_locomotion()
         self.reset(np.arange(self.num_robots))
 
@@ -265,13 +293,18 @@ class NavigationTask:
         loco, c = self.locomotion, self.config
         self._actions = np.stack([self.decoder.normalise(actions), self._actions[0]])
         commands = self.decoder.decode(actions)
-        self._commands = np.concatenate([self._share(commands)[None], self._commands[:-1]])
+        share = command_share(commands, self.decoder)
+        self._commands = np.concatenate([share[None], self._commands[:-1]])
         loco.command[:] = commands
         failed = np.zeros(self.num_robots, dtype=bool)
         force = np.zeros((self.num_robots, 5))
         reached = self._reached_at >= 0
         for _ in range(c.decimation):
-            loco.act(self.low.predict(loco.observe(c.randomisation, self.rng))[0])
+            low_actions = self.low.predict(loco.observe(c.randomisation, self.rng))[0]
+            # A robot that has blown up sees no numbers, so it has no action either. Its decision is
+            # carried through all the same: who reads its observation then finds it out.
+            low_actions[~np.isfinite(low_actions).all(axis=1)] = 0.0
+            loco.act(low_actions)
             failed |= self._failed(loco.world)
             state = loco.world.state
             now = np.column_stack([state.trunk_force, state.leg_force])
@@ -282,7 +315,16 @@ class NavigationTask:
         self._reached_at[reached & (self._reached_at < 0)] = self.elapsed[
             reached & (self._reached_at < 0)
         ]
-        terms = rewards.high_terms(self._high_step(force), self.step_seconds)
+        seen = high_step(
+            loco,
+            self.goal,
+            self.elapsed / self.horizon,
+            self._actions,
+            self._commands,
+            force,
+            c.rewards,
+        )
+        terms = rewards.high_terms(seen, self.step_seconds)
         reward = np.sum(list(terms.values()), axis=0)
         held = reached & (self.elapsed - self._reached_at >= self._hold)
         truncated = ~failed & (held | (self.elapsed >= self.horizon))
@@ -297,26 +339,6 @@ class NavigationTask:
     def _failed(self, world: World) -> NDArray[np.bool_]:
         x, y = world.state.position[:, 0], world.state.position[:, 1]
         return is_fallen(world) | ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
-
-    def _high_step(self, force: Array) -> rewards.HighStep:
-        loco = self.locomotion
-        state = loco.world.state
-        offset = self.goal - state.position[:, :2]
-        x, y = state.position[:, 0], state.position[:, 1]
-        return rewards.HighStep(
-            distance=np.linalg.norm(offset, axis=1),
-            heading_error=np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw,
-            time_share=self.elapsed / self.horizon,
-            lin_vel=state.lin_vel,
-            ang_vel=state.ang_vel,
-            joint_speed=state.qd,
-            base_height=state.position[:, 2] - loco.world.support_height(x, y),
-            standing_height=loco.robot.base_height,
-            actions=self._actions,
-            commands=self._commands,
-            contact_forces=force,
-            config=self.config.rewards,
-        )
 
     def observe(self) -> NDArray[np.float32]:
         """o^H, (M, actor_dim)."""
@@ -394,20 +416,52 @@ class NavigationTask:
         stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
         return stats
 
-    def state_dict(self) -> dict[str, Any]:
-        """JSON-ready state from which ``restart`` gives the same future everywhere."""
-        curriculum = {k: np.asarray(v).tolist() for k, v in self.curriculum.state_dict().items()}
+    def forget(self) -> None:
+        """Let what follows depend on ``state_dict`` alone, see ``World.forget``."""
+        self.locomotion.world.forget()
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Of the episodes under way."""
         return {
-            "rng": self.rng.bit_generator.state,
-            "tiles_drawn": self._tiles_drawn,
-            "curriculum": curriculum,
+            "goal": self.goal,
+            "elapsed": self.elapsed,
+            "reached_at": self._reached_at,
+            "next_push": self._next_push,
+            "actions": self._actions,
+            "commands": self._commands,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a ``state_dict``; call ``restart`` afterwards."""
+    def state_dict(self) -> State:
+        """The curriculum and the robots' ``episodes`` under way, as copies."""
+        return {
+            "rng": self.rng.bit_generator.state,
+            "tiles_drawn": self.tiles.drawn,
+            "curriculum": self.curriculum.state_dict(),
+            "episodes": {
+                **copies(self._arrays()),
+                "locomotion": self.locomotion.state_dict(),
+                "tiles": self.tiles.state_dict(),
+            },
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on from a ``state_dict``, as a ``forget`` there would have gone on; from one without
+        ``episodes`` with new ones.
+
+        Raises:
+            ValueError: a state of other robots.
+        """
         self.rng.bit_generator.state = state["rng"]
-        self._tiles_drawn = int(state["tiles_drawn"])
-        self.curriculum.load_state_dict({k: np.array(v) for k, v in state["curriculum"].items()})
+        self.curriculum.load_state_dict(state["curriculum"])
+        self.tiles.drawn = int(state["tiles_drawn"])
+        if "episodes" not in state:
+            self.restart()
+            return
+        episodes = state["episodes"]
+        fill(self._arrays(), episodes)
+        self.tiles.load_state_dict(episodes["tiles"])
+        self.locomotion.world.upload_terrain()
+        self.locomotion.load_state_dict(episodes["locomotion"])
 
     def close(self) -> None:
         """Disconnect from Bullet."""

@@ -7,21 +7,25 @@ nothing of rewards or tasks; ``tdgc.low_env`` trains on it and ``tdgc.high_env``
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.commands import INDEX, NUM_COMMANDS, default_command, gait_index, observed_command
 from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
-from tdgc.gaits import GAITS, PhaseClock
+from tdgc.gaits import GAITS, PhaseClock, swing_profile
 from tdgc.robot import (
     FOOT_RADIUS,
     NUM_JOINTS,
     Array,
+    commanded_pose,
     foot_kinematics,
     joint_targets,
     nominal_pose,
     yaw_quaternion,
 )
+from tdgc.state import State, copies, fill
 from tdgc.terrain import TileField
 from tdgc.world import World
 
@@ -125,6 +129,12 @@ class Locomotion:
         """Names and sizes of the parts of ``observe``'s rows."""
         return ACTOR_LAYOUT + (GYRO_LAYOUT if self.gyro else ())
 
+    def pose(self) -> Array:
+        """q0, the pose that actions start from and joint errors refer to, (M, 12) rad."""
+        if not self.robot.commanded_pose:
+            return np.tile(self.nominal, (self.num_robots, 1))
+        return commanded_pose(self.robot, self.command, swing_profile(self.clock.phases))
+
     def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:
         """Stand the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)
         rad, with their clocks at ``clock`` (n,), and forget their histories."""
@@ -180,7 +190,8 @@ class Locomotion:
         limit = self.robot.action_limit
         clipped = np.clip(np.asarray(actions, dtype=np.float64), -limit, limit)
         self.actions = np.stack([clipped, self.actions[0]])
-        self.targets = np.concatenate([joint_targets(self.robot, clipped)[None], self.targets[:-1]])
+        targets = joint_targets(self.robot, self.pose(), clipped)
+        self.targets = np.concatenate([targets[None], self.targets[:-1]])
         self.world.step(self.targets, self.delay, self.joint_offset)
         self.clock.advance(
             self.physics.control_dt,
@@ -188,6 +199,38 @@ class Locomotion:
             self.command[:, 12:],
             self.command[:, INDEX["duration"]],
         )
+
+    def _arrays(self) -> dict[str, Array]:
+        """All that one step leaves for the next but what Bullet remembers of contacts."""
+        measured = [f.name for f in dataclasses.fields(self.world.state) if f.init]
+        return {
+            "command": self.command,
+            "actions": self.actions,
+            "targets": self.targets,
+            "clock": self.clock.clock,
+            "delay": self.delay,
+            "joint_offset": self.joint_offset,
+            "friction": self.friction,
+            "payload": self.payload,
+            "strength": self.world.strength,
+            **{name: getattr(self.world.state, name) for name in measured},
+        }
+
+    def state_dict(self) -> State:
+        """Everything of the robots, as copies; the ground is the caller's."""
+        return copies(self._arrays())
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on from a ``state_dict``, as a ``World.forget`` there would have gone on.
+
+        Raises:
+            ValueError: a state of other robots.
+        """
+        fill(self._arrays(), state)
+        self.world.state.derive()
+        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
+        self.world.set_dynamics(np.arange(self.num_robots), self.friction, self.payload)
+        self.world.forget()
 
     def observe(
         self,
@@ -201,7 +244,7 @@ class Locomotion:
         state = self.world.state
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
         gravity = state.gravity
-        error = state.q - self.joint_offset - self.nominal
+        error = state.q - self.joint_offset - self.pose()
         speed = state.qd
         if noise is not None and rng is not None:
 

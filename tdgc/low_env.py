@@ -19,16 +19,17 @@ from tdgc.config import LowLevelConfig
 from tdgc.gaits import GAITS, gait_embedding, swing_profile
 from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
 from tdgc.robot import HIPS_XY, NUM_JOINTS, Array, wrap_angle
+from tdgc.state import State, copies, fill
 from tdgc.terrain import (
     MAX_LEVEL,
     TILE_SIZE,
     TRENCH_DEPTH,
+    TRENCH_SPACING,
+    ZONE,
     Tile,
-    TileField,
     draw_start_goal,
-    make_tile,
-    tile_rng,
 )
+from tdgc.tiles import FLAT, TrainingTiles
 from tdgc.world import World
 
 FALL_HEIGHT = 0.15  # m, trunk above the support surface (paper Sec. IV-C)
@@ -72,21 +73,25 @@ _CLEARANCE = (0.05, 0.13)  # m, added to the least swing height at difficulty 0 
 _BEND = 0.3  # share of the pitch and roll ranges at difficulty 1
 _HEADING_GAIN = 1.0  # 1/s, yaw rate asked per rad of heading error
 
-# Training tiles are 4 m wide, since Bullet keeps 600 bytes for each sample of a height field.
-TILE_CROP = 2.0  # m at either side
-#: A training family beside those of ``tdgc.terrain``: no relief, free commands, no levels.
-FLAT = "flat"
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
 
 # Of the commands drawn, in the order of GAITS. Free: pace and bound take longest to learn.
 # Crossing: trot climbs best, and with all gaits alike the worst one decides how far levels rise.
 _FREE_GAITS = (0.2, 0.2, 0.25, 0.35)
-_CROSSING_GAITS = (0.6, 0.1, 0.15, 0.15)
+_CROSSING_GAITS = (0.8, 0.05, 0.075, 0.075)
+# Over trenches half of the crossings leap: pronk with a stride of about the stance length puts
+# front and rear feet on the same lines, and a trench fits between two of them if the steps are
+# timed, which the crossing does and the decision level has to learn.
+_TRENCH_GAITS = (0.3, 0.5, 0.1, 0.1)
+_LEAP_SPEED = (0.85, 1.0)  # m/s
+_LEAP_SWING = 0.09  # m at most: four legs drawn up at once drop the trunk
+_STRIDE = (0.36, 0.42)  # m, three of 0.417 m make a trench's distance to the next
+_TIMING_GAIN = 1.5  # share of the frequency for each cycle that the feet are out of time
 # Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet land
 # on the same lines, so that a trench fits between two of them. Drawn evenly, such commands are too
-# rare: of 0.86 m/s at 2 Hz the robot did 0.5.
+# rare: of 0.86 m/s at 2 Hz the robot did 0.5. As shares of the ranges: 0.7-1 m/s at 2-2.75 Hz.
 _LEAP_SHARE = 0.15
-_LEAP: dict[str, tuple[float, float]] = {"vx": (0.7, 1.0), "frequency": (2.0, 2.75)}
+_LEAP = {"vx": (0.85, 1.0), "frequency": (0.0, 0.375)}
 
 # Command curriculum: a gait's velocity range grows when it tracks well over an evaluation batch.
 _GROWTH = 0.05
@@ -95,6 +100,28 @@ _GROW_LIN, _GROW_YAW = 0.5, 0.5
 # Share of feet in contact as desired: speed comes after gait. At 0.8 bound never left its first
 # ranges, since its rear feet lift late, and then undershot every faster command.
 _GROW_CONTACT = 0.7
+
+
+def straddling_frequency(
+    x: Array, speed: Array, clock: Array, stride: Array, length: Array, duty: Array
+) -> Array:
+    """Step frequency in Hz at which pronk lands at either side of the trenches, all (M,).
+
+    Args:
+        x: m, trunk along the tile.
+        speed: m/s, forward.
+        clock: the gait's, 0 where the feet touch down.
+        stride, length: m, from one landing to the next, and between front and rear feet.
+        duty: share of a cycle in stance.
+
+    Feed-forward keeps the stride; to it comes what brings the next landing of the front feet half a
+    stride before the centre of the nearest trench.
+    """
+    centres = ZONE[0] + TRENCH_SPACING * (np.arange(4) + 0.5)
+    landing = x + 0.5 * length + 0.5 * duty * stride  # feet touch down ahead of where they rest
+    trench = centres[np.abs(landing[:, None] - centres).argmin(axis=1)]
+    late = np.mod((landing - trench) / stride - clock, 1.0) - 0.5  # 0.5 turns -0.5 strides to 0
+    return np.asarray(speed / stride * (1.0 + _TIMING_GAIN * late))
 
 
 def is_fallen(world: World) -> NDArray[np.bool_]:
@@ -155,19 +182,22 @@ class LowLevelTask:
         m = num_robots
         self.column = np.arange(m) % len(config.families)
         self.level = self.rng.integers(0, min(3, config.levels), m)
-        self._flat = np.array([config.families[c] == FLAT for c in self.column])
+        families = [config.families[c] for c in self.column]
+        # Those without relief have free commands and no levels.
+        self._flat = np.array([family == FLAT for family in families])
+        self._trenches = np.array([family == "gap" for family in families])
         self._rugged = ~self._flat if config.terrain == "tiles" else np.zeros(m, dtype=bool)
-        self._seed, self._tiles_drawn = seed, 0
-        self._drawn_level = np.full(m, -1)
-        self.field = self._build_field()
-        if self.field is not None:
-            self._draw_tiles(np.arange(m))
+        self.tiles = None if config.terrain == "plane" else TrainingTiles(families, seed, shallow)
+        self.field = None if self.tiles is None else self.tiles.field
+        if self.tiles is not None:
+            self.tiles.draw(np.arange(m), self.level)
         self.locomotion = self._build_locomotion()
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._began = np.zeros(m, dtype=np.int64)  # elapsed at the start of the episode
         self._next_push = np.zeros(m, dtype=np.int64)
         self._crossing = np.zeros(m, dtype=bool)
         self._speed = np.zeros(m)
+        self._stride = np.zeros(m)  # m, of crossings that leap, else 0
         self._facing = np.zeros(m)
         self._waypoint = np.zeros((m, 2))
         self._reached = np.zeros(m, dtype=bool)
@@ -185,24 +215,6 @@ class LowLevelTask:
         self.action_space = gym.spaces.Box(-limit, limit, (NUM_JOINTS,), np.float32)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
 
-    def _build_field(self) -> TileField | None:
-        """A tile of its own for every robot, of its level and family."""
-        if self.config.terrain == "plane":
-            return None
-        return TileField((self.num_robots, 1), crop=TILE_CROP)
-
-    def _draw_tiles(self, index: NDArray[np.integer]) -> None:
-        """Fresh tiles for the robots ``index`` (n,) at their present levels."""
-        assert self.field is not None
-        for i in index:
-            family, level = self.config.families[self.column[i]], int(self.level[i])
-            if family == FLAT:
-                continue  # the field is flat where nothing was placed
-            rng = tile_rng(self._seed, family, level, self._tiles_drawn)
-            self._tiles_drawn += 1
-            self.field.place(int(i), 0, shallow(make_tile(family, level / MAX_LEVEL, rng), level))
-        self._drawn_level[index] = self.level[index]
-
     def _build_locomotion(self) -> Locomotion:
         c = self.config
         return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro, self._visual)
@@ -213,16 +225,15 @@ class LowLevelTask:
         """Start new episodes for the robots ``index`` (n,)."""
         n, rng = len(index), self.rng
         self._finish_statistics(index)
-        if self.field is None:
+        if self.tiles is None:
             xy = np.stack([index % 10, index // 10], axis=1) * _PLANE_SPACING
             yaw = rng.uniform(-np.pi, np.pi, n)
             self._crossing[index] = False
         else:
-            stale = index[self._drawn_level[index] != self.level[index]]
-            if stale.size:
-                self._draw_tiles(stale)
-                self.locomotion.world.upload_terrain(stale)
-            self._origin[index] = self.field.origin(index, np.zeros_like(index))
+            changed = self.tiles.begin(index, self.level)
+            if changed.size:
+                self.locomotion.world.upload_terrain(changed)
+            self._origin[index] = self.tiles.field.origin(index, np.zeros_like(index))
             start, goal = draw_start_goal(rng, (n,))
             # Free commands lead anywhere, so those robots of a flat tile start in its middle.
             start[self._flat[index], :2] = 0.5 * TILE_SIZE
@@ -246,13 +257,10 @@ class LowLevelTask:
             self._steer_crossings()
 
     def restart(self) -> None:
-        """End every episode, redraw the terrain and build the world anew.
-
-        Bullet's own history is gone afterwards: what follows depends on ``state_dict`` alone.
-        """
+        """End every episode, redraw the terrain and build the world anew, as a run begins."""
         self.locomotion.world.close()
-        if self.field is not None:
-            self._draw_tiles(np.arange(self.num_robots))
+        if self.tiles is not None:
+            self.tiles.draw(np.arange(self.num_robots), self.level)
         self.locomotion = self._build_locomotion()
         self._gait_scores[:] = 0.0
         self.reset(np.arange(self.num_robots))
@@ -366,21 +374,30 @@ class LowLevelTask:
 
     def _draw_commands(self, index: NDArray[np.integer]) -> None:
         n, rng, command = len(index), self.rng, self.locomotion.command
-        shares = np.where(self._crossing[index, None], _CROSSING_GAITS, _FREE_GAITS)
+        crossing, trenches = self._crossing[index], self._trenches[index]
+        shares = np.where(crossing[:, None], _CROSSING_GAITS, _FREE_GAITS)
+        shares[crossing & trenches] = _TRENCH_GAITS
         gait = np.sum(rng.uniform(size=(n, 1)) > np.cumsum(shares, axis=1)[:, :-1], axis=1)
         low, high = self._bounds(index)
         values = rng.uniform(low, high)
         leap = ~self._crossing[index] & (rng.uniform(size=n) < _LEAP_SHARE)
         gait[leap] = GAITS.index("pronk")
-        for name, (slowest, fastest) in _LEAP.items():
-            values[leap, INDEX[name]] = rng.uniform(slowest, fastest, int(leap.sum()))
+        for name, (least, most) in _LEAP.items():
+            j, share = INDEX[name], rng.uniform(least, most, int(leap.sum()))
+            values[leap, j] = low[leap, j] + share * (high - low)[leap, j]
         values[:, :3] *= self.command_share[gait][:, None]
         # A tenth stands: stepping on the spot is asked for at every goal.
         values[rng.uniform(size=n) < 0.1, :3] = 0.0
+        leaps = crossing & trenches & (gait == GAITS.index("pronk"))
+        swing = INDEX["swing_height"]
+        values[leaps, swing] = rng.uniform(self._low[swing], _LEAP_SWING, int(leaps.sum()))
         command[index] = np.concatenate([values, gait_embedding(gait)], axis=1)
-        self._speed[index] = rng.uniform(*_CROSSING_SPEED, n)
+        self._stride[index] = np.where(leaps, rng.uniform(*_STRIDE, n), 0.0)
+        slow, fast = rng.uniform(*_CROSSING_SPEED, n), rng.uniform(*_LEAP_SPEED, n)
+        self._speed[index] = np.where(leaps, fast, slow)
         free = rng.uniform(-np.pi, np.pi, n)
-        self._facing[index] = np.where(rng.uniform(size=n) < _FACING_SHARE, 0.0, free)
+        ahead = leaps | (rng.uniform(size=n) < _FACING_SHARE)
+        self._facing[index] = np.where(ahead, 0.0, free)
 
     def _bounds(self, index: NDArray[np.integer]) -> tuple[Array, Array]:
         """Lower and upper bounds (n, 12) of the commands drawn for the robots ``index``."""
@@ -422,6 +439,19 @@ class LowLevelTask:
         rows = np.flatnonzero(self._crossing)
         self.locomotion.command[rows, :2] = velocity[rows]
         self.locomotion.command[rows, 2] = turn[rows]
+        leaping = np.flatnonzero(self._crossing & (self._stride > 0.0))
+        if leaping.size:
+            command = self.locomotion.command[leaping]
+            frequency = straddling_frequency(
+                (state.position[:, 0] - self._origin[:, 0])[leaping],
+                np.maximum(state.heading_vel[leaping, 0], 0.0),
+                self.locomotion.clock.clock[leaping],
+                self._stride[leaping],
+                command[:, INDEX["stance_length"]],
+                command[:, INDEX["duration"]],
+            )
+            j = INDEX["frequency"]
+            self.locomotion.command[leaping, j] = np.clip(frequency, self._low[j], self._high[j])
 
     def _schedule_push(self, index: NDArray[np.integer]) -> None:
         seconds = self.rng.uniform(*self.config.randomisation.push_interval, len(index))
@@ -529,21 +559,61 @@ class LowLevelTask:
 
     # ------------------------------------------------------------------ resume
 
-    def state_dict(self) -> dict[str, Any]:
-        """JSON-ready state from which ``restart`` gives the same future everywhere."""
+    def forget(self) -> None:
+        """Let what follows depend on ``state_dict`` alone, see ``World.forget``."""
+        self.locomotion.world.forget()
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Of the episodes under way."""
         return {
-            "rng": self.rng.bit_generator.state,
-            "tiles_drawn": self._tiles_drawn,
-            "level": self.level.tolist(),
-            "command_share": self.command_share.tolist(),
+            "elapsed": self.elapsed,
+            "began": self._began,
+            "next_push": self._next_push,
+            "crossing": self._crossing,
+            "speed": self._speed,
+            "stride": self._stride,
+            "facing": self._facing,
+            "waypoint": self._waypoint,
+            "reached": self._reached,
+            "was_contact": self._was_contact,
+            "origin": self._origin,
+            "gait_scores": self._gait_scores,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a ``state_dict``; call ``restart`` afterwards."""
+    def state_dict(self) -> State:
+        """What was learned of the robots, and their ``episodes`` under way, as copies."""
+        return {
+            "rng": self.rng.bit_generator.state,
+            "tiles_drawn": 0 if self.tiles is None else self.tiles.drawn,
+            **copies({"level": self.level, "command_share": self.command_share}),
+            "episodes": {
+                **copies(self._arrays()),
+                "locomotion": self.locomotion.state_dict(),
+                "tiles": {} if self.tiles is None else self.tiles.state_dict(),
+            },
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on from a ``state_dict``, as a ``forget`` there would have gone on; from one without
+        ``episodes`` with new ones.
+
+        Raises:
+            ValueError: a state of other robots.
+        """
         self.rng.bit_generator.state = state["rng"]
-        self._tiles_drawn = int(state["tiles_drawn"])
-        self.level = np.array(state["level"], dtype=np.int64)
-        self.command_share = np.array(state["command_share"], dtype=np.float64)
+        fill({"level": self.level, "command_share": self.command_share}, state)
+        if self.tiles is not None:
+            self.tiles.drawn = int(state["tiles_drawn"])
+        if "episodes" not in state:
+            self.restart()
+            return
+        episodes = state["episodes"]
+        fill(self._arrays(), episodes)
+        if self.tiles is not None:
+            self.tiles.load_state_dict(episodes["tiles"])
+            self.locomotion.world.upload_terrain()
+        self.locomotion.load_state_dict(episodes["locomotion"])
+        self._ground = self._measure_ground()
 
     def close(self) -> None:
         """Disconnect from Bullet."""

@@ -1,9 +1,10 @@
-"""Figures from files: rows and logs in, PNG out. Nothing here simulates or trains."""
+"""Figures: files of rows, logs and recordings in, PNG out. Nothing here simulates or trains."""
 
 from __future__ import annotations
 
 import csv
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +18,22 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
+from tdgc.commands import CONTINUOUS, INDEX, UNITS, gait_index
 from tdgc.evaluation import POSE_SECONDS, tile_of
-from tdgc.gaits import GAITS
+from tdgc.gaits import FEET, GAITS
 from tdgc.low_env import GOAL_RADIUS
+from tdgc.recording import Recording, spans, stretches
 from tdgc.robot import Array, wrap_angle
 from tdgc.terrain import TILE_SIZE
 
 # Okabe and Ito's palette, which colour-blind eyes tell apart.
-_COLOURS = {"tdgc": "#0072B2", "gp": "#D55E00"}
-_GAIT_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7")
+POLICY_COLOURS = {"tdgc": "#0072B2", "tdgc-tuned": "#009E73", "gp": "#D55E00"}
+GAIT_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7")
 _GROUND = LinearSegmentedColormap.from_list("ground", ["#ffffff", "#707070"])  # low to high
 
 _MOVING = 0.1  # m/s, slower than that is no direction of travel (v_th of the high level's rewards)
@@ -38,8 +42,13 @@ _DRAWN = 3  # episodes a family and policy in the figure of trajectories
 
 
 def _save(figure: Figure, out: Path) -> None:
-    figure.savefig(out, dpi=120)
-    plt.close(figure)
+    partial = out.with_suffix(".tmp")
+    try:
+        figure.savefig(partial, dpi=120, format="png")
+        os.replace(partial, out)
+    finally:
+        partial.unlink(missing_ok=True)
+        plt.close(figure)
 
 
 # ---------------------------------------------------------------------------- evaluation
@@ -106,7 +115,7 @@ def success_by_level(summary: Path, out: Path) -> None:
                     markersize=4,
                     capsize=2,
                     label=policy,
-                    color=_COLOURS[policy],
+                    color=POLICY_COLOURS[policy],
                 )
                 axis.set_xticks(list(cells))
             axis.set(title=family, xlabel="level", ylim=(-3, 103))
@@ -139,14 +148,14 @@ def gait_shares(folder: Path, out: Path) -> None:
                 for gait in GAITS
             ]
             ends = np.cumsum(shares)
-            axis.barh([y] * len(GAITS), shares, left=ends - shares, color=_GAIT_COLOURS)
+            axis.barh([y] * len(GAITS), shares, left=ends - shares, color=GAIT_COLOURS)
             for end, share in zip(ends, shares, strict=True):
                 if share >= 8.0:  # room for the number
                     axis.text(end - share / 2, y, f"{share:.0f}", ha="center", va="center")
         axis.set_yticks(range(len(families)), families)
         axis.set(title=policy, xlabel="share of the time (%)", xlim=(0, 100))
     axes[0, 0].invert_yaxis()
-    patches = [Patch(color=colour) for colour in _GAIT_COLOURS]
+    patches = [Patch(color=colour) for colour in GAIT_COLOURS]
     figure.legend(patches, GAITS, loc="outside right center")
     _save(figure, out)
 
@@ -188,7 +197,9 @@ def headings(folder: Path, out: Path) -> None:
             shifted = np.where(angles < edges[0], angles + 2 * np.pi, angles)
             counts, _ = np.histogram(shifted, edges)
             shares = 100 * counts / max(1, len(angles))
-            axis.bar(edges[:-1] + 0.5 * width, shares, width, color=_COLOURS[policy], alpha=0.8)
+            axis.bar(
+                edges[:-1] + 0.5 * width, shares, width, color=POLICY_COLOURS[policy], alpha=0.8
+            )
             axis.set_theta_zero_location("N")
             axis.set_xticks(np.arange(4) * np.pi / 2, ["ahead", "left", "back", "right"])
             axis.tick_params(labelsize=7, pad=-1)
@@ -251,7 +262,10 @@ def trajectories(folder: Path, out: Path) -> None:
 
 def _draw_track(axis: Any, run: _Run) -> None:
     """The base's way, its heading once a second, the goal, and how the episode ended."""
-    colour, white = _COLOURS[run.row["policy"]], [withStroke(linewidth=3.5, foreground="white")]
+    colour, white = (
+        POLICY_COLOURS[run.row["policy"]],
+        [withStroke(linewidth=3.5, foreground="white")],
+    )
     x, y, yaw = run.track.T
     axis.plot(x, y, color=colour, linewidth=1.6, path_effects=white)
     second = slice(None, None, round(1.0 / POSE_SECONDS))
@@ -265,6 +279,94 @@ def _draw_track(axis: Any, run: _Run) -> None:
     axis.add_patch(Circle(tuple(run.goal), GOAL_RADIUS, fill=False, linestyle="--"))
     outcome = run.row["outcome"].replace("_", " ")
     axis.set_title(f"{run.row['policy']}: {outcome}, {float(run.row['time_s']):.1f} s", fontsize=8)
+
+
+# ---------------------------------------------------------------------------- one episode
+
+_MEASURED = "#D55E00"
+_DESIRED = "#B0CDEB"  # contact as the gait desires, behind the actual one
+
+
+def sheet(recording: Recording, out: Path) -> None:
+    """One episode on one time axis: gait, contacts (Hildebrand), base height, all commands.
+
+    Where a command has been measured too, that is drawn over it; dotted lines are its bounds.
+    """
+    r = recording
+    ends: Array = r.dt * np.arange(1.0, len(r.command) + 1.0)
+    standing = r.robot.base_height
+    # Gait and contacts, then the four commands that were measured, then the others.
+    ratios = [1.7] + [1.0] * 4 + [0.6] * (len(CONTINUOUS) - 4)
+    figure, axes = plt.subplots(
+        len(ratios),
+        1,
+        figsize=(12, 13.5),
+        sharex=True,
+        height_ratios=ratios,
+    )
+    figure.subplots_adjust(left=0.11, right=0.985, top=0.965, bottom=0.065, hspace=0.12)
+    _draw_contacts(axes[0], r)
+    h = INDEX["body_height"]  # added to the standing height
+    _draw_command(axes[1], ends, standing + r.command[:, h], standing + r.bounds[h], r.height)
+    axes[1].set_ylabel("base height\n(m)")
+    rest = [j for j in range(len(CONTINUOUS)) if j != h]
+    for axis, j in zip(axes[2:], rest, strict=True):
+        measured = r.velocity[:, j] if j < r.velocity.shape[1] else None
+        _draw_command(axis, ends, r.command[:, j], r.bounds[j], measured)
+        unit = "" if UNITS[j] == "1" else f" ({UNITS[j]})"
+        axis.set_ylabel(f"{CONTINUOUS[j].replace('_', ' ')}\n{unit}".strip())
+    for axis in axes:
+        axis.yaxis.label.set(rotation=0, ha="right", va="center", fontsize=8)
+        axis.yaxis.set_label_coords(-0.045, 0.5)
+        axis.tick_params(labelsize=7)
+        axis.grid(axis="x", alpha=0.3)
+    axes[-1].set_xlabel("time (s)", fontsize=8)
+    axes[-1].set_xlim(0.0, ends[-1])
+    where = f"{r.family}, level {r.level}, {r.condition}, episode {r.episode}"
+    figure.suptitle(f"{r.policy}: {r.ending}   ({where}, seed {r.seed})", fontsize=11, y=0.99)
+    handles = [
+        *(Patch(color=GAIT_COLOURS[g], label=GAITS[g]) for g in np.unique(gait_index(r.command))),
+        Patch(color=_DESIRED, label="contact desired"),
+        Patch(color="black", label="in contact"),
+        Line2D([], [], color="black", label="commanded"),
+        Line2D([], [], color=_MEASURED, label="measured"),
+        Line2D([], [], color="0.5", linestyle=":", label="bounds"),
+    ]
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=8)
+    _save(figure, out)
+
+
+def _draw_contacts(axis: Any, r: Recording) -> None:
+    """The gait as a band; a row a foot below it, actual contact within the desired."""
+    for a, b, gait in stretches(gait_index(r.command)):
+        axis.broken_barh([(a * r.dt, (b - a) * r.dt)], (-0.75, 0.55), color=GAIT_COLOURS[gait])
+    for foot in range(len(FEET)):
+        for flags, thick, colour in (
+            (r.desired[:, foot], 0.84, _DESIRED),
+            (r.contact[:, foot], 0.36, "black"),
+        ):
+            bars = [(a * r.dt, (b - a) * r.dt) for a, b in spans(flags)]
+            axis.broken_barh(bars, (foot + 0.5 - thick / 2, thick), color=colour, linewidth=0)
+    axis.set_yticks([-0.475, *(np.arange(len(FEET)) + 0.5)], ["gait", *FEET])
+    axis.set_ylim(len(FEET), -0.85)
+
+
+def _draw_command(
+    axis: Any, ends: Array, command: Array, bounds: Array, measured: Array | None
+) -> None:
+    """A command over time, its bounds, and what was measured of it."""
+    for bound in bounds:
+        axis.axhline(bound, color="0.5", linestyle=":", linewidth=1)
+    seen = [command, bounds]
+    if measured is not None:
+        axis.plot(ends, measured, color=_MEASURED, linewidth=0.9)
+        seen.append(measured)
+    # A command holds during the whole control step, at whose end it was noted.
+    axis.stairs(command, np.append(0.0, ends), baseline=None, color="black", linewidth=1.2)
+    bottom, top = min(map(np.min, seen)), max(map(np.max, seen))
+    margin = 0.12 * (top - bottom)
+    axis.set_ylim(bottom - margin, top + margin)
+    axis.yaxis.set_major_locator(MaxNLocator(2 if measured is None else 4))
 
 
 # ---------------------------------------------------------------------------- training

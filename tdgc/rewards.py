@@ -34,7 +34,7 @@ class LowStep:
         state: the robots after the step.
         command: (M, 15).
         phases: (M, 4) warped foot phases; contact: (M, 4) desired contact C; swing: (M, 4)
-            triangle of the swing.
+            profile of the swing.
         base_height: (M,) m, trunk above the ground under it.
         foot_height: (M, 4) m, foot centre above the support surface under it.
         standing_height: m, to which the body height command is added.
@@ -126,7 +126,7 @@ def raibert_foothold(s: LowStep) -> Array:
 
 
 def swing_height(s: LowStep) -> Array:
-    """Squared error of the feet's height against the swing triangle, weighed by 1 - C, m^2."""
+    """Squared error of the feet's height against the swing profile, weighed by 1 - C, m^2."""
     wanted = s.cmd("swing_height")[:, None] * s.swing + FOOT_RADIUS
     return np.sum((s.foot_height - wanted) ** 2 * (1.0 - s.contact), axis=1)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tdgc.commands import INDEX, default_command
 from tdgc.config import ConfigError, RobotConfig
 from tdgc.gaits import FEET
 
@@ -27,6 +28,7 @@ ABDUCTION = 0.08  # m, from the hip joint out to the thigh joint
 THIGH = 0.213  # m
 CALF = 0.213  # m
 FOOT_RADIUS = 0.022  # m
+HIGHEST_FOOT = -0.1  # m against the hips: no commanded pose folds a leg further
 TRUNK_MASS = 5.6  # kg
 #: Joint limits in rad, (12, 2), as in the URDF.
 JOINT_LIMITS: Array = np.tile([[-0.86, 0.86], [-0.69, 4.5], [-2.82, -0.89]], (4, 1))
@@ -57,11 +59,32 @@ def nominal_pose(config: RobotConfig) -> Array:
     return np.stack([config.nominal_hip * _SIDE, thigh, np.full(4, config.nominal_calf)], 1).ravel()
 
 
-def joint_targets(config: RobotConfig, actions: Array) -> Array:
-    """q* = q0 + alpha clip(a, -a_max, a_max): (M, 12) -> (M, 12) rad (Sec. IV-A)."""
+def commanded_pose(config: RobotConfig, command: Array, swing: Array) -> Array:
+    """q0(c, phi): the nominal pose bent to the commanded behaviour, (M, 15), (M, 4) -> (M, 12) rad.
+
+    The feet stand under a level trunk of the commanded height, as wide and long apart as asked, and
+    are raised along ``swing``, the profile of ``gaits.swing_profile``, by what the swing height
+    exceeds its default. At default commands it is the paper's q0, on which a policy hardly learned
+    to follow these commands (docs/experiments.md); pitch and roll it learned. It is where actions
+    start from, not a constraint: a foot out of reach is put at the nearest angles that the calf
+    has, and none comes higher than ``HIGHEST_FOOT``.
+    """
+    standing = foot_kinematics(nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))[0]
+    change = command - default_command()
+    feet = np.repeat(standing, len(command), axis=0)
+    feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * _FRONT
+    feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * _SIDE
+    feet[..., 2] -= change[:, INDEX["body_height"], None]
+    feet[..., 2] += change[:, INDEX["swing_height"], None] * swing
+    feet[..., 2] = np.minimum(feet[..., 2], HIGHEST_FOOT)
+    return leg_angles(feet)
+
+
+def joint_targets(config: RobotConfig, pose: Array, actions: Array) -> Array:
+    """q* = q0 + alpha clip(a, -a_max, a_max): (M, 12) twice -> (M, 12) rad (Sec. IV-A)."""
     scale = config.action_scale * np.tile([config.hip_scale, 1.0, 1.0], 4)
     clipped = np.clip(actions, -config.action_limit, config.action_limit)
-    return np.asarray(nominal_pose(config) + scale * clipped)
+    return np.asarray(pose + scale * clipped)
 
 
 def pd_torque(error: Array, speed: Array, strength: Array, config: RobotConfig) -> Array:
@@ -99,6 +122,27 @@ def foot_kinematics(q: Array, qd: Array) -> tuple[Array, Array]:
     position = np.stack([x + HIPS_XY[:, 0], y + HIPS_XY[:, 1], z], axis=-1)
     velocity = np.stack([x_d, -z * hip_d - down_d * sh, y * hip_d + down_d * ch], axis=-1)
     return position, velocity
+
+
+def leg_angles(feet: Array) -> Array:
+    """Joint angles that put the foot centres there, the inverse of ``foot_kinematics``.
+
+    Args:
+        feet: (M, 4, 3) m in the trunk's frame, below the hips.
+
+    Returns:
+        (M, 12) rad, the calf within its limits: a leg too short or too long points at its foot.
+    """
+    x, y, z = np.moveaxis(feet - np.pad(HIPS_XY, ((0, 0), (0, 1))), -1, 0)
+    out = ABDUCTION * _SIDE
+    down = np.sqrt(np.maximum(y * y + z * z - out * out, 0.0))  # below the thigh joint, hip at 0
+    hip = wrap_angle(np.arctan2(z, y) - np.arctan2(-down, out))
+    square = x * x + down * down
+    bend = (square - THIGH * THIGH - CALF * CALF) / (2.0 * THIGH * CALF)
+    calf = np.clip(-np.arccos(np.clip(bend, -1.0, 1.0)), *JOINT_LIMITS[2])
+    lean = np.arctan2(CALF * np.sin(calf), THIGH + CALF * np.cos(calf))
+    thigh = np.arctan2(-x, down) - lean
+    return np.stack([hip, thigh, calf], axis=-1).reshape(len(feet), NUM_JOINTS)
 
 
 def rotation_matrix(quaternion: Array) -> Array:

@@ -2,7 +2,8 @@
 
 A run folder holds ``config.json``, ``log.jsonl`` (a row every ``log_steps``), TensorBoard's event
 files, ``policy.safetensors`` with ``policy.json`` (the last policy, ready to be used) and
-``checkpoints/`` with the two newest states from which a run goes on exactly.
+``checkpoints/`` with the two newest states, from which a run goes on, in the middle of its
+episodes, as if it had not been stopped.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from typing import Any, Protocol, cast
 import numpy as np
 import safetensors.torch
 import torch as th
+from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -35,9 +38,14 @@ from tqdm import tqdm
 
 from tdgc import __version__, policies
 from tdgc.config import Config, ConfigError, from_dict, to_dict, with_overrides
+from tdgc.state import State, join, split
 from tdgc.vec import TaskVecEnv, WorkerError
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
+_VERSION = 2
+_READABLE = (1, 2)  # version 1 has no episodes under way: its runs go on with new ones
+#: Names of what the recurrent learner remembers of the episodes under way.
+_LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
 
 class CheckpointError(ValueError):
@@ -70,15 +78,22 @@ def _restore_random(tensors: dict[str, th.Tensor], states: dict[str, Any]) -> No
 def snapshot(
     model: BaseAlgorithm, extra: dict[str, Any]
 ) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
-    """The learner's whole state and ``extra`` as tensors and header, see ``load_learner``."""
+    """The learner's whole state and ``extra`` as tensors and header, see ``load_learner`` and
+    ``workers_of``."""
     tensors = {f"policy.{k}": v for k, v in model.policy.state_dict().items()}
     optimiser = model.policy.optimizer.state_dict()
     for index, slots in optimiser["state"].items():
         tensors |= {f"optimizer.{index}.{k}": th.as_tensor(v) for k, v in slots.items()}
+    memory: RNNStates | None = getattr(model, "_last_lstm_states", None)
+    if memory is not None:
+        tensors |= zip(_LSTM, (*memory.pi, *memory.vf), strict=True)
+    arrays: dict[str, NDArray[Any]] = {}
+    extra = split(extra, "extra", arrays)
+    tensors |= {name: th.from_numpy(array) for name, array in arrays.items()}
     random_tensors, random_states = _random_states()
     header = {
         "format": "tdgc-checkpoint",
-        "version": 1,
+        "version": _VERSION,
         "code": __version__,
         "num_timesteps": model.num_timesteps,
         "n_updates": model._n_updates,
@@ -125,8 +140,9 @@ def read_checkpoint(path: Path) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
     try:
         data = (path / "state.safetensors").read_bytes()
         header = json.loads((path / "state.json").read_bytes())
-        if header.get("format") != "tdgc-checkpoint" or header.get("version") != 1:
-            raise CheckpointError(f"{path}: not a tdgc checkpoint of version 1")
+        if header.get("format") != "tdgc-checkpoint" or header.get("version") not in _READABLE:
+            versions = " or ".join(map(str, _READABLE))
+            raise CheckpointError(f"{path}: not a tdgc checkpoint of version {versions}")
         if hashlib.sha256(data).hexdigest() != header["sha256"]:
             raise CheckpointError(f"{path}: its checksum does not match, it is damaged")
         return safetensors.torch.load(data), header
@@ -174,9 +190,19 @@ def load_learner(
     except (RuntimeError, KeyError, ValueError) as error:
         line = str(error).splitlines()[0]
         raise CheckpointError(f"the checkpoint does not fit the configuration: {line}") from error
+    if _LSTM[0] in tensors:
+        h_pi, c_pi, h_vf, c_vf = (tensors[name].to(model.device) for name in _LSTM)
+        cast(Any, model)._last_lstm_states = RNNStates(pi=(h_pi, c_pi), vf=(h_vf, c_vf))
     model.num_timesteps = int(header["num_timesteps"])
     model._n_updates = int(header["n_updates"])
     _restore_random(tensors, header["random"])
+
+
+def workers_of(tensors: dict[str, th.Tensor], header: dict[str, Any]) -> list[State]:
+    """The workers' states of a checkpoint, see ``TaskVecEnv.load_state_dicts``."""
+    arrays = {k: v.numpy() for k, v in tensors.items() if k.startswith("extra.")}
+    states: list[State] = join(header["workers"], arrays)
+    return states
 
 
 # ---------------------------------------------------------------------------- the loop
@@ -213,7 +239,8 @@ class RunCallback(BaseCallback):
         meta: goes into the policy's file: configuration, seed.
         summarise: (sums of all workers) -> values to log.
         interruption: when to stop.
-        log_steps, checkpoint_steps: control steps between log rows and between checkpoints.
+        log_steps: control steps between log rows.
+        checkpoint_seconds: wall time between checkpoints.
         seconds_before: wall time of the run so far.
 
     Attributes:
@@ -228,7 +255,7 @@ class RunCallback(BaseCallback):
         summarise: Callable[[dict[str, float]], dict[str, float]],
         interruption: Interruption,
         log_steps: int,
-        checkpoint_steps: int,
+        checkpoint_seconds: float,
         total_steps: int,
         seconds_before: float = 0.0,
         phase: int = 0,
@@ -236,11 +263,11 @@ class RunCallback(BaseCallback):
         super().__init__()
         self.run, self.env, self.meta = run, env, meta
         self.summarise, self.interruption = summarise, interruption
-        self.log_steps, self.checkpoint_steps = log_steps, checkpoint_steps
+        self.log_steps, self.checkpoint_seconds = log_steps, checkpoint_seconds
         self.total_steps = total_steps
         self.phase = phase
         self._started = time.monotonic() - seconds_before
-        self._saved_at = 0
+        self._saved_at = 0.0
         self._logged_at = (0, 0.0)
         self._bar: Any = None
         self._faults: list[dict[str, Any]] = []  # since the last log row
@@ -253,7 +280,7 @@ class RunCallback(BaseCallback):
         return time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
-        self._saved_at = self.num_timesteps
+        self._saved_at = self.seconds
         self._logged_at = (self.num_timesteps, self.seconds)
         self._bar = tqdm(
             total=self.total_steps,
@@ -265,10 +292,12 @@ class RunCallback(BaseCallback):
         )
 
     def _on_rollout_start(self) -> None:
-        # Between an update and the next rollout the learner's state is whole. Steps, not seconds:
-        # a checkpoint begins new episodes, so where it falls must follow from the seed alone.
-        if self.num_timesteps - self._saved_at >= self.checkpoint_steps:
-            self.checkpoint()
+        # Between an update and the next rollout the learner's state is whole. The workers forget in
+        # every run at every rollout, so that a checkpoint may be written at any or at none.
+        self.env.forget()
+        if self.seconds - self._saved_at >= self.checkpoint_seconds:
+            self.save()
+            self._saved_at = self.seconds
 
     def _on_step(self) -> bool:
         self.tell_faults()
@@ -285,12 +314,6 @@ class RunCallback(BaseCallback):
         self._bar.update(self.num_timesteps - self._bar.n)
         if self.num_timesteps - self._logged_at[0] >= self.log_steps:
             self._log()
-
-    def checkpoint(self) -> None:
-        """Save everything and start all episodes anew, as a resumed run would."""
-        self.save()
-        restart(self.model, self.env)
-        self._saved_at = self.num_timesteps
 
     def save(self) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
         """Write the policy and a checkpoint, or tell why not; returns the snapshot."""
@@ -367,10 +390,9 @@ def append_line(path: Path, line: str) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
-def restart(model: BaseAlgorithm, env: TaskVecEnv) -> None:
-    """Begin new episodes everywhere; the learner forgets the observations it held."""
-    model._last_obs = env.reset()
-    model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
+def attach(model: BaseAlgorithm, env: TaskVecEnv) -> None:
+    """Show the learner what the robots saw last."""
+    model._last_obs, model._last_episode_starts = env.seen(), env.starts()
     model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
 
 
@@ -421,7 +443,7 @@ class TrainConfig(Protocol):
     def log_steps(self) -> int: ...
 
     @property
-    def checkpoint_steps(self) -> int: ...
+    def checkpoint_seconds(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -468,7 +490,9 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     if args.resume:
         if not stored.is_file():
             raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
-        config = from_dict(type(config), json.loads(stored.read_text(encoding="utf-8")))
+        data = json.loads(stored.read_text(encoding="utf-8"))
+        data.pop("checkpoint_steps", None)  # of runs whose checkpoints were so many steps apart
+        config = from_dict(type(config), data)
     elif stored.exists():
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
@@ -514,15 +538,17 @@ def run(
             model.set_logger(tensorboard_logger(args.out / "tensorboard"))
             callback = RunCallback(
                 args.out, env, meta, summarise, interruption, config.log_steps,
-                config.checkpoint_steps, config.steps, seconds, number,
+                config.checkpoint_seconds, config.steps, seconds, number,
             )  # fmt: skip
             if carried is not None:
                 load_learner(model, *carried)
-                if carried[1]["phase"] == number:
-                    env.load_state_dicts(carried[1]["workers"])
             elif args.init is not None:
                 policies.load_into(args.init, model.policy)
-            restart(model, env)
+            if carried is not None and carried[1]["phase"] == number:
+                env.load_state_dicts(workers_of(*carried))
+            else:
+                env.reset()
+            attach(model, env)
             try:
                 finished = learn(model, callback, phase.until)
             except WorkerError:

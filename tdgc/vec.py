@@ -28,6 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
+from tdgc.state import State, copies
+
 #: Observations and rewards are scaled to be of order one; beyond this a robot has blown up. For the
 #: low level it means 50 m/s, 400 rad/s or 10 m above the ground.
 SANE = 100.0
@@ -41,7 +43,9 @@ _START_SECONDS = 600.0
 class Task(Protocol):
     """An MDP of M robots, as ``tdgc.low_env.LowLevelTask`` is one.
 
-    ``state_dict()["rng"]`` is the state of all that is random in it.
+    ``state_dict()["rng"]`` is the state of all that is random in it and ``["episodes"]`` that of
+    the episodes under way; a task that loads a state without them begins new ones. ``forget``
+    changes nothing of the state, and makes what follows depend on nothing else.
     """
 
     num_robots: int
@@ -59,11 +63,13 @@ class Task(Protocol):
 
     def restart(self) -> None: ...
 
+    def forget(self) -> None: ...
+
     def take_stats(self) -> dict[str, float]: ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> State: ...
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: State) -> None: ...
 
     def close(self) -> None: ...
 
@@ -164,6 +170,18 @@ def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
     return int(blown.sum())
 
 
+def _load(task: Task, views: dict[str, NDArray[Any]], state: State) -> None:
+    """Go on from a worker's state; what was seen last is part of it, for it may be noisy."""
+    task.load_state_dict(state)
+    views["obs"][:] = state["obs"] if "obs" in state else task.observe()
+
+
+def _lasting(state: State) -> State:
+    """A worker's state without the episodes under way."""
+    under_way = ("episodes", "obs", "returns", "lengths")
+    return {key: value for key, value in state.items() if key not in under_way}
+
+
 def _end_with_parent() -> None:
     """End this process when its parent has, whatever it is busy with."""
     parent = mp.parent_process()
@@ -178,11 +196,11 @@ def _work(
     rows: slice,
     seed: int,
     shared: _Shared,
-    state: dict[str, Any] | None = None,
+    state: State | None = None,
 ) -> None:
     """A worker's life: tell its state, then answer one word at a time until told to close.
 
-    With the ``state`` of a worker that failed it takes over all but the randomness, and restarts.
+    With the ``state`` of a worker that failed it takes over all but the randomness.
     """
     # What a terminal or a batch system sends to all processes is the parent's to answer.
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -193,9 +211,7 @@ def _work(
         views = {name: view[rows] for name, view in shared.arrays().items()}
         task = make_task(rows.stop - rows.start, seed)
         if state is not None:
-            task.load_state_dict({**state, "rng": task.state_dict()["rng"]})
-            task.restart()
-            views["obs"][:] = task.observe()
+            _load(task, views, {**state, "rng": task.state_dict()["rng"]})
         busy, blow_ups = 0.0, 0
         pipe.send(task.state_dict())
         while True:
@@ -207,10 +223,12 @@ def _work(
             elif word == "restart":
                 task.restart()
                 views["obs"][:] = task.observe()
+            elif word == "forget":
+                task.forget()
             elif word == "load":
-                task.load_state_dict(argument)
+                _load(task, views, argument)
             elif word == "state":
-                answer = task.state_dict()
+                answer = {**task.state_dict(), "obs": views["obs"].copy()}
             elif word == "stats":
                 answer = {**task.take_stats(), "busy_seconds": busy, "blow_ups": float(blow_ups)}
                 blow_ups = 0
@@ -255,9 +273,10 @@ class TaskVecEnv(VecEnv):
     Robots whose episode ended are reset within ``step``; ``infos`` holds their last observation
     and whether they were truncated, as SB3 expects.
 
-    With ``recover`` a worker that dies, hangs or raises is started anew from its last known state
-    (see ``state_dicts``) with a seed of its own; its robots' episodes end, truncated, with no
-    reward for the step. ``FAULTS`` faults within ``FAULT_STEPS`` steps are raised all the same.
+    With ``recover`` a worker that dies, hangs or raises is started anew with a seed of its own and
+    what its robots had learned when its state was last asked for (see ``state_dicts``); their
+    episodes end, truncated, with no reward for the step. ``FAULTS`` faults within ``FAULT_STEPS``
+    steps are raised all the same.
 
     Args:
         make_task: picklable, called in each worker as ``make_task(robots, seed)``.
@@ -311,16 +330,17 @@ class TaskVecEnv(VecEnv):
             self._pipes.append(pipe)
             self._processes.append(process)
         # The last known ones; a worker begins by telling its own.
-        self._states = [self._receive(k, _START_SECONDS) for k in range(workers)]
+        states = [self._receive(k, _START_SECONDS) for k in range(workers)]
         if self._broken:
             self.close()
             raise self._broken[min(self._broken)]
+        self._states: list[State] = [_lasting(state) for state in states]
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
 
     # ------------------------------------------------------------------ the workers
 
-    def _start(self, worker: int, state: dict[str, Any] | None = None) -> tuple[Connection, Any]:
+    def _start(self, worker: int, state: State | None = None) -> tuple[Connection, Any]:
         context = mp.get_context("spawn")
         ours, theirs = context.Pipe()
         seed = worker_seed(self._seed, worker, self._restarts[worker])
@@ -335,7 +355,7 @@ class TaskVecEnv(VecEnv):
         theirs.close()
         return ours, process
 
-    def _replace(self, worker: int, restarts: int, state: dict[str, Any] | None = None) -> None:
+    def _replace(self, worker: int, restarts: int, state: State | None = None) -> None:
         """Put a new process in a worker's place; it has to be waited for."""
         self._processes[worker].kill()
         self._processes[worker].join()
@@ -420,7 +440,19 @@ class TaskVecEnv(VecEnv):
         self._mend()
         self._returns[:] = 0.0
         self._lengths[:] = 0
+        return self.seen()
+
+    def seen(self) -> NDArray[np.float32]:
+        """The last observations, (num_envs, n)."""
         return self._views["obs"].copy()
+
+    def starts(self) -> NDArray[np.bool_]:
+        """Whether the last observation is the first of its episode, (num_envs,)."""
+        return self._lengths == 0
+
+    def forget(self) -> None:
+        """Let what follows depend on ``state_dicts`` alone, see ``Task``."""
+        self._ask("forget")
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
         self._views["actions"][:] = actions
@@ -459,28 +491,39 @@ class TaskVecEnv(VecEnv):
         """
         return [sums for sums in self._ask("stats") if not isinstance(sums, WorkerError)]
 
-    def state_dicts(self) -> list[dict[str, Any]]:
-        """Each worker's state, from which ``reset`` gives the same future, and its ``restarts``.
+    def state_dicts(self) -> list[State]:
+        """Each worker's state, with what its robots saw last and its ``restarts``.
 
-        A broken worker's is its last known one.
+        Who loads it goes on as this does after ``forget``, bit for bit. A broken worker's is its
+        last known one, without the episodes under way.
         """
+        states = []
         for k, state in enumerate(self._ask("state")):
-            if not isinstance(state, WorkerError):
-                self._states[k] = state
-        return [
-            {**state, "restarts": restarts}
-            for state, restarts in zip(self._states, self._restarts, strict=True)
-        ]
+            if isinstance(state, WorkerError):
+                state = self._states[k]
+            else:
+                self._states[k] = _lasting(state)
+                rows = self._rows[k]
+                state |= copies({"returns": self._returns[rows], "lengths": self._lengths[rows]})
+            states.append({**state, "restarts": self._restarts[k]})
+        return states
 
-    def load_state_dicts(self, states: list[dict[str, Any]]) -> None:
-        """Take over the workers' states; call ``reset`` afterwards.
+    def load_state_dicts(self, states: list[State]) -> None:
+        """Go on from the workers' states; episodes that are missing in one begin anew.
 
         Raises:
-            ValueError: states of another number of workers.
+            ValueError: states of another number of workers or robots.
             WorkerError: a worker failed.
         """
         if len(states) != len(self._pipes):
             raise ValueError(f"states of {len(states)} workers do not fit {len(self._pipes)}")
+        for rows, state in zip(self._rows, states, strict=True):
+            robots = rows.stop - rows.start
+            returns = state.get("returns", np.zeros(robots))
+            if len(returns) != robots:
+                raise ValueError(f"a state of {len(returns)} robots does not fit {robots}")
+            self._returns[rows] = returns
+            self._lengths[rows] = state.get("lengths", 0)
         for k, state in enumerate(states):
             restarts = state.get("restarts", 0)
             if restarts != self._restarts[k]:  # its seed is another one
@@ -490,7 +533,7 @@ class TaskVecEnv(VecEnv):
         self._receive_all()
         if self._broken:
             raise self._broken[min(self._broken)]
-        self._states = list(states)
+        self._states = [_lasting(state) for state in states]
 
     def close(self) -> None:
         """Stop the workers, gently and then not."""

@@ -5,9 +5,14 @@ Robots pass through each other (a collision mask). Arrays have a leading axis of
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import functools
+import os
+import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +34,8 @@ from tdgc.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
 
 _GROUND, _ROBOT = 1, 2  # collision groups: robots meet the ground and nothing else
 GRAVITY = 9.81  # m/s^2
+_PARKED = 50.0  # m above its place nothing touches a robot: terrain stays within HEIGHT_RANGE
+_SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out from it
 _FOOT_REACH = 0.03  # m below the foot's centre sits a contact that is the foot's, not the calf's
 
 
@@ -39,8 +46,8 @@ class _Client:
     each function is bound once, at its first use.
     """
 
-    def __init__(self, first_row: int) -> None:
-        self.id: int = pybullet.connect(pybullet.DIRECT)
+    def __init__(self, first_row: int, window: bool) -> None:
+        self.id: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
         self.first_row = first_row  # of the world's robots
         self.rows: dict[int, int] = {}  # row of the world that a body of this client is
         self.ground = -1
@@ -63,10 +70,11 @@ class World:
     """M robots on a plane, or each on a tile row of its own in a field.
 
     Robots are spread over several Bullet clients, ``CLIENT_ROBOTS`` in each; a client holds its own
-    robots' part of the field only. ``visual`` keeps what is needed for pictures.
+    robots' part of the field only. ``visual`` keeps what is needed for pictures, ``window`` shows
+    all in Bullet's own window.
 
     Attributes:
-        state: the ``RobotState`` after the last step or reset.
+        state: the ``RobotState`` after the last step, push or reset.
         strength: (M, 1) motor strength, times gains and torque limits.
         bullet_seconds: wall time spent inside Bullet's step so far.
     """
@@ -78,6 +86,7 @@ class World:
         physics: PhysicsConfig,
         field: TileField | None = None,
         visual: bool = False,
+        window: bool = False,
     ) -> None:
         if field is not None and field.shape[0] != num_robots:
             raise ValueError(f"{num_robots} robots need as many tile rows, not {field.shape[0]}")
@@ -94,7 +103,7 @@ class World:
         self._client_of: list[_Client] = []
         parts = -(-num_robots // CLIENT_ROBOTS)
         for rows in np.array_split(np.arange(num_robots), parts):
-            client = _Client(int(rows[0]))
+            client = _Client(int(rows[0]), window)
             client.setGravity(0.0, 0.0, -GRAVITY)
             # No early stop of the solver: it would couple robots through the worst residual.
             client.setPhysicsEngineParameter(
@@ -183,7 +192,7 @@ class World:
         # Apart and high, so that nothing touches before the first reset.
         body = client.loadURDF(
             str(urdf_path(self.robot)),
-            basePosition=[2.0 * place, 0.0, 50.0],
+            basePosition=[2.0 * place, 0.0, _PARKED],
             flags=pybullet.URDF_USE_INERTIA_FROM_FILE
             | (0 if self._visual else pybullet.URDF_IGNORE_VISUAL_SHAPES),
         )
@@ -227,17 +236,37 @@ class World:
         with joint angles ``q`` (n, 12); refreshes ``state``."""
         state = self.state
         for k, i in enumerate(index):
-            body, client = self._bodies[i], self._client_of[i]
-            client.resetBasePositionAndOrientation(body, position[k], quaternion[k])
-            client.resetBaseVelocity(body, [0.0] * 3, [0.0] * 3)
-            for joint, angle in zip(self._joints, q[k], strict=True):
-                client.resetJointState(body, joint, angle, 0.0)
             state.position[i], state.quaternion[i], state.q[i] = position[k], quaternion[k], q[k]
             for still in (state.lin_vel, state.ang_vel, state.qd, state.torque):
                 still[i] = 0.0
             state.foot_force[i] = state.leg_force[i] = 0.0
             state.trunk_force[i] = 0.0
+            self._put(int(i))
         state.derive()
+
+    def _put(self, i: int) -> None:
+        """Bring robot ``i`` of Bullet to where ``state`` has it."""
+        body, client, state = self._bodies[i], self._client_of[i], self.state
+        client.resetBasePositionAndOrientation(body, state.position[i], state.quaternion[i])
+        client.resetBaseVelocity(body, state.lin_vel[i], state.ang_vel[i])
+        for joint, angle, speed in zip(self._joints, state.q[i], state.qd[i], strict=True):
+            client.resetJointState(body, joint, angle, speed)
+
+    def forget(self) -> None:
+        """Let Bullet forget the contacts of the steps before; ``state`` stays as it is.
+
+        Bullet starts its solver from the last step's contact forces. Afterwards what follows is
+        what would follow in a world built anew with the same ``state``, strength and dynamics, bit
+        for bit. For that every robot spends one physics step high above the ground.
+        """
+        for i in self._active:
+            body, client = self._bodies[i], self._client_of[i]
+            high = self.state.position[i] + [0.0, 0.0, _PARKED]
+            client.resetBasePositionAndOrientation(body, high, self.state.quaternion[i])
+        for client in dict.fromkeys(self._client_of[i] for i in self._active):
+            client.stepSimulation()
+        for i in self._active:
+            self._put(int(i))
 
     def set_dynamics(self, index: ArrayLike, friction: Array, payload: Array) -> None:
         """Friction of every link and extra mass of the trunk, (n,) and (n,) kg."""
@@ -255,11 +284,15 @@ class World:
             )
 
     def push(self, index: ArrayLike, velocity: Array) -> None:
-        """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index``."""
+        """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index``; refreshes
+        ``state``."""
+        state = self.state
         for k, i in enumerate(np.asarray(index)):
-            body, client = self._bodies[i], self._client_of[i]
-            linear, angular = client.getBaseVelocity(body)
-            client.resetBaseVelocity(body, np.add(linear, velocity[k]), angular)
+            state.lin_vel[i] += velocity[k]
+            self._client_of[i].resetBaseVelocity(
+                self._bodies[i], state.lin_vel[i], state.ang_vel[i]
+            )
+        state.derive()
 
     def retire(self, index: ArrayLike) -> None:
         """Take the robots ``index`` out for good; their rows of ``state`` stay as they are."""
@@ -344,16 +377,26 @@ class World:
         return np.zeros_like(x) if self.field is None else self.field.support_at(x, y)
 
     def picture(
-        self, row: int, width: int = 640, height: int = 400, azimuth: float = -0.9
+        self,
+        row: int,
+        width: int = 640,
+        height: int = 400,
+        azimuth: float = -0.9,
+        elevation: float = 0.33,
+        distance: float = 1.4,
+        target: Array | None = None,
     ) -> NDArray[np.uint8]:
         """Robot ``row`` and its ground from the side, (height, width, 3), without a display.
 
-        ``azimuth`` is where the camera stands, rad from the world's x axis. Worlds that were not
-        made with ``visual`` have nothing to show.
+        The camera looks at ``target`` (3,) m, the trunk unless told, from ``distance`` m away:
+        ``azimuth`` rad from the world's x axis and ``elevation`` rad above the target. Worlds that
+        were not made with ``visual`` have nothing to show.
         """
-        client, target = self._client_of[row], self.state.position[row]
-        eye = target + [1.3 * np.cos(azimuth), 1.3 * np.sin(azimuth), 0.45]
-        _, _, pixels, _, _ = client.getCameraImage(
+        client = self._client_of[row]
+        target = self.state.position[row] if target is None else target
+        away = [np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]
+        eye = target + distance * np.cos(elevation) * np.array(away)
+        _, _, pixels, _, bodies = client.getCameraImage(
             width,
             height,
             client.computeViewMatrix(eye.tolist(), target.tolist(), [0.0, 0.0, 1.0]),
@@ -361,10 +404,140 @@ class World:
             renderer=pybullet.ER_TINY_RENDERER,
             lightDirection=[0.5, -1.0, 2.0],
         )
-        return np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
+        image = np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
+        image[np.reshape(bodies, (height, width)) < 0] = _SKY  # -1 is no body
+        return image
 
     def close(self) -> None:
         """Disconnect from Bullet; the world is of no use afterwards."""
         for client in self._clients:
-            client.disconnect()
+            if client.isConnected():  # a window may have been closed by hand
+                client.disconnect()
         self._clients.clear()
+
+
+class WindowError(RuntimeError):
+    """Bullet's window cannot be opened, or was closed; the message is one line."""
+
+
+def check_display() -> None:
+    """Ask for a display before Bullet does: it would end the whole process without one.
+
+    Raises:
+        WindowError: there is none.
+    """
+    if sys.platform != "linux":
+        return  # elsewhere the system always has one
+    name = os.environ.get("DISPLAY", "")
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError as error:
+        raise WindowError("Bullet's window needs X11, and libX11.so.6 is not installed") from error
+    x11.XOpenDisplay.argtypes, x11.XOpenDisplay.restype = [ctypes.c_char_p], ctypes.c_void_p
+    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
+    display = x11.XOpenDisplay(None) if name else None
+    if not display:
+        raise WindowError(f"Bullet's window needs a display; DISPLAY='{name}' is none")
+    x11.XCloseDisplay(display)
+
+
+class Stage(World):
+    """One robot on its tile, moved by hand and not simulated: for films and Bullet's window.
+
+    Args:
+        robot, physics, field: as in ``World``.
+        window: open Bullet's window.
+
+    Raises:
+        WindowError: no display.
+    """
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        physics: PhysicsConfig,
+        field: TileField,
+        window: bool = False,
+    ) -> None:
+        if window:
+            check_display()
+        super().__init__(1, robot, physics, field, visual=True, window=window)
+        self._client = self._clients[0]
+        self._sliders: list[int] = []
+        self._text = -1  # none yet
+        if window:
+            for flag in (
+                pybullet.COV_ENABLE_RGB_BUFFER_PREVIEW,
+                pybullet.COV_ENABLE_DEPTH_BUFFER_PREVIEW,
+                pybullet.COV_ENABLE_SEGMENTATION_MARK_PREVIEW,
+            ):
+                self._client.configureDebugVisualizer(flag, 0)
+            # As the films have it: from behind, to the right and above.
+            self._client.resetDebugVisualizerCamera(1.8, -50.0, -29.0, [0.0, 0.0, 0.0])
+
+    def show(self, position: Array, quaternion: Array, q: Array) -> None:
+        """Put the robot at ``position`` (3,), ``quaternion`` (4,) with joint angles ``q`` (12,).
+
+        Raises:
+            WindowError: the window was closed.
+        """
+        with self._in_window():
+            self.reset_robots([0], position[None], quaternion[None], q[None])
+
+    def paint(self, texture: Path) -> None:
+        """Lay a picture over the tile: its rows run along y, its columns against x."""
+        image = self._client.loadTexture(str(texture))
+        self._client.changeVisualShape(
+            self._client.ground, -1, textureUniqueId=image, rgbaColor=[1.0] * 4
+        )
+
+    def mark(self, foot: Array, colour: tuple[float, float, float]) -> None:
+        """A pole with a ball on top, 0.8 m tall, its foot at ``foot`` (3,) m."""
+        for kind, height, size in (
+            (pybullet.GEOM_CYLINDER, 0.4, {"radius": 0.015, "length": 0.8}),
+            (pybullet.GEOM_SPHERE, 0.8, {"radius": 0.06}),
+        ):
+            shape = self._client.createVisualShape(kind, rgbaColor=[*colour, 1.0], **size)
+            self._client.createMultiBody(0.0, -1, shape, basePosition=foot + [0.0, 0.0, height])
+
+    # ------------------------------------------------------------------ the window
+
+    def add_slider(self, name: str, low: float, high: float, start: float) -> None:
+        """A slider in the window; where ``low`` is above ``high``, a button that counts."""
+        self._sliders.append(self._client.addUserDebugParameter(name, low, high, start))
+
+    def read_sliders(self) -> Array:
+        """Where all sliders stand, in the order in which they were added.
+
+        Raises:
+            WindowError: the window was closed.
+        """
+        with self._in_window():
+            return np.array([self._client.readUserDebugParameter(i) for i in self._sliders])
+
+    def follow(self, text: str) -> None:
+        """Turn the window's camera to the robot, as far and from where it is; ``text`` above it.
+
+        Raises:
+            WindowError: the window was closed.
+        """
+        position, black = self.state.position[0], [0.0, 0.0, 0.0]
+        with self._in_window():
+            yaw, pitch, distance = self._client.getDebugVisualizerCamera()[8:11]
+            self._client.resetDebugVisualizerCamera(distance, yaw, pitch, position.tolist())
+            # Bullet writes from there to the right, so that begins at the left of the robot.
+            turn, away = np.radians(yaw), 0.35 * distance
+            place = position + [-away * np.cos(turn), -away * np.sin(turn), 0.35]
+            self._text = self._client.addUserDebugText(
+                text, place.tolist(), black, 1.0, replaceItemUniqueId=self._text
+            )
+
+    @contextlib.contextmanager
+    def _in_window(self) -> Iterator[None]:
+        """Bullet's errors in here are the window's, where that was closed."""
+        try:
+            yield
+        except pybullet.error as error:
+            if self._client.isConnected():
+                raise
+            raise WindowError("the window was closed") from error

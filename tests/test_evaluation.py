@@ -217,9 +217,8 @@ def test_summary_counts_and_averages():
     def row(family: str, level: int, outcome: str) -> Episode:
         nothing = np.zeros((1, 3))
         shares = (1.0, 0.0, 0.0, 0.0)
-        return Episode(
-            "gp", "nominal", family, level, 0, 0, outcome, 1.0, 1.0, shares, nothing[0, :2], nothing
-        )
+        where = ("gp", "nominal", family, level, 0, 0)
+        return Episode(*where, outcome, 1.0, 1.0, 1.0, shares, nothing[0, :2], nothing)
 
     rows = [
         row("rough", 6, "reached"), row("rough", 6, "fell"),
@@ -249,6 +248,7 @@ def test_results_have_a_row_and_a_track_an_episode(table):
     rows = rows_of(table)
     assert list(rows[0]) == [
         "policy", "condition", "family", "level", "episode", "seed", "outcome", "time_s", "path_m",
+        "energy_j",
         *(f"share_{gait}" for gait in GAITS),
     ]  # fmt: skip
     assert [(r["policy"], r["episode"]) for r in rows] == [

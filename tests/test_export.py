@@ -30,7 +30,7 @@ from tdgc.locomotion import (
 )
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
 from tdgc.recurrent import FastRecurrentPolicy
-from tdgc.robot import JOINTS, joint_targets
+from tdgc.robot import JOINTS, nominal_pose
 
 LOW = PRETRAINED / "low"
 LOW_POLICY, LOW_CONFIG = load_low(LOW)
@@ -152,7 +152,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.mark.parametrize(("gyro", "symmetric"), [(False, True), (True, False)])
 def test_low_level_is_the_executors_step(tmp_path: Path, gyro: bool, symmetric: bool) -> None:
-    robot = RobotConfig(action_limit=0.6, hip_scale=0.4, nominal_hip=0.07)
+    robot = RobotConfig(action_limit=0.6, hip_scale=0.4, nominal_hip=0.07, commanded_pose=symmetric)
     config = LowLevelConfig(gyro=gyro, robot=robot)
     policy = random_low(tmp_path / "low", config, symmetric)
     level = LowLevel(policy, config)
@@ -343,8 +343,7 @@ def test_interface_says_how_to_drive_the_joints(folder: Path) -> None:
     assert control["kp"] == {"unit": "N m/rad", "value": [20.0] * 12}
     assert control["kd"] == {"unit": "N m s/rad", "value": [0.6] * 12}
     assert control["torque_limit"] == {"unit": "N m", "value": [23.7, 23.7, 35.5] * 4}
-    rest = joint_targets(LOW_CONFIG.robot, np.zeros((1, 12)))[0]
-    assert control["nominal_pose"]["value"] == rest.tolist()
+    assert control["nominal_pose"]["value"] == nominal_pose(LOW_CONFIG.robot).tolist()
     assert table["feet"] == ["FL", "FR", "RL", "RR"]
     assert table["gaits"]["trot"] == {"phase": 0.5, "offset": 0.0, "bound": 0.0}
     assert table["commands"][4] == {"name": "frequency", "unit": "Hz", "low": 2.0, "high": 4.0}

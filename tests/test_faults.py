@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tdgc.config import LowLevelConfig, PhysicsConfig
+from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.low_env import LowLevelTask
 from tdgc.robot import Array
+from tdgc.state import State, join, split
 from tdgc.vec import FAULT_STEPS, Fault, TaskVecEnv, WorkerError, worker_seed
 
 # What a robot's action makes of its task.
@@ -27,8 +28,9 @@ RAISE, DIE, HANG, NAN_SEEN, NAN_EARNED, INFINITE, FAR = range(2, 9)
 class Fragile:
     """Robots that see their number, the level, the steps of their episode, and a random number.
 
-    The level rises with each step of the task and is all that it learns, as a curriculum is; the
-    random number is drawn at each restart. A robot earns its action.
+    They remember nothing beside their state, so there is nothing to forget. The level rises with
+    each step of the task and is all that it learns, as a curriculum is; the random number is drawn
+    at each restart. A robot earns its action.
     """
 
     actor_dim = 4
@@ -38,7 +40,7 @@ class Fragile:
     def __init__(self, robots: int, seed: int) -> None:
         self.num_robots = robots
         self.rng = np.random.default_rng(seed)
-        self.level, self.restarts = 0, 0
+        self.level, self.restarts, self.forgot = 0, 0, 0
         self.restart()
 
     def reset(self, index: Any) -> None:
@@ -75,14 +77,23 @@ class Fragile:
         self.action = np.zeros(self.num_robots)
 
     def take_stats(self) -> dict[str, float]:
-        return {"restarts": float(self.restarts)}
+        return {"restarts": float(self.restarts), "forgot": float(self.forgot)}
 
-    def state_dict(self) -> dict[str, Any]:
-        return {"rng": self.rng.bit_generator.state, "level": self.level}
+    def forget(self) -> None:
+        self.forgot += 1
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def state_dict(self) -> State:
+        episodes = {"steps": self.steps.copy(), "drawn": self.drawn}
+        return {"rng": self.rng.bit_generator.state, "level": self.level, "episodes": episodes}
+
+    def load_state_dict(self, state: State) -> None:
         self.rng.bit_generator.state = state["rng"]
         self.level = state["level"]
+        if "episodes" not in state:
+            self.restart()
+            return
+        self.steps = state["episodes"]["steps"].copy()
+        self.drawn = state["episodes"]["drawn"]
 
     def close(self) -> None:
         pass
@@ -208,13 +219,37 @@ def test_faults_between_steps(fragile: TaskVecEnv) -> None:
     obs = fragile.reset()
     assert obs[:, 1].tolist() == [0.0, 0.0, 1.0, 1.0] and (obs[:, 2] == 0.0).all()
     assert [(f.worker, f.restarts) for f in fragile.faults] == [(0, 1), (1, 1)]
-    states = json.loads(json.dumps(fragile.state_dicts()))
-    future = [fragile.reset(), step(fragile, actions())[0], fragile.reset()]
+    for _ in range(3):
+        seen, *_ = step(fragile, actions())
+    arrays: dict[str, Any] = {}
+    states = json.loads(json.dumps(split(fragile.state_dicts(), "", arrays)))
+    future = [step(fragile, actions())[0], fragile.reset(), step(fragile, actions())[0]]
+    other = TaskVecEnv(Fragile, 4, 2, seed=3, spaces=SPACES)
+    other.load_state_dicts(join(states, arrays))
+    np.testing.assert_array_equal(other.seen(), seen)
+    assert [state["restarts"] for state in other.state_dicts()] == [1, 1]
+    again = [step(other, actions())[0], other.reset(), step(other, actions())[0]]
+    np.testing.assert_array_equal(again, future)
+    other.close()
+
+
+def test_the_state_of_a_broken_worker_begins_new_episodes(fragile: TaskVecEnv) -> None:
+    """Its robots' last episodes are gone; those of the other worker go on."""
+    fragile.reset()
+    step(fragile, actions())
+    fragile.state_dicts()
+    seen, *_ = step(fragile, actions())
+    os.kill(fragile.worker_pids[1], signal.SIGKILL)
+    fragile.forget()  # which it does not answer
+    states = fragile.state_dicts()
+    assert [set(state) >= {"episodes", "obs", "lengths"} for state in states] == [True, False]
     other = TaskVecEnv(Fragile, 4, 2, seed=3, spaces=SPACES)
     other.load_state_dicts(states)
-    assert other.state_dicts() == states
-    again = [other.reset(), step(other, actions())[0], other.reset()]
-    np.testing.assert_array_equal(again, future)
+    assert other.starts().tolist() == [False, False, True, True]
+    np.testing.assert_array_equal(other.seen()[:2], seen[:2])
+    assert other.seen()[2:, 1:3].tolist() == [[1.0, 0.0]] * 2  # the level it was known to have
+    other.forget()
+    assert [sums["forgot"] for sums in other.stats()] == [1.0, 1.0]
     other.close()
 
 
@@ -263,7 +298,9 @@ class Poisoned(LowLevelTask):
 
 
 def make_poisoned(robots: int, seed: int) -> Poisoned:
-    return Poisoned(LowLevelConfig(physics=PhysicsConfig(substeps=4)), robots, seed)
+    # Actions of zero mean standing still then, whatever the commands.
+    robot = RobotConfig(commanded_pose=False)
+    return Poisoned(LowLevelConfig(robot=robot, physics=PhysicsConfig(substeps=4)), robots, seed)
 
 
 def test_a_blow_up_inside_bullet() -> None:

@@ -123,8 +123,9 @@ def test_desired_contact_is_symmetric_about_mid_stance_and_joins_at_the_cycle_en
 
 
 def test_swing_profile() -> None:
-    phases = np.array([0.0, 0.25, 0.5, 0.625, 0.75, 0.875, 1.0])
-    assert swing_profile(phases).tolist() == [0.0, 0.0, 0.0, 0.5, 1.0, 0.5, 0.0]
+    phases = np.array([0.0, 0.25, 0.5, 7.0 / 12.0, 0.75, 11.0 / 12.0, 1.0])
+    expected = [0.0, 0.0, 0.0, 0.5, 1.0, 0.5, 0.0]  # half a sine
+    np.testing.assert_allclose(swing_profile(phases), expected, atol=1e-12)
 
 
 def test_clock_advances_by_frequency_and_wraps() -> None:

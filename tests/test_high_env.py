@@ -213,26 +213,56 @@ def test_robots_begin_spread_over_the_first_levels():
     task.close()
 
 
-def test_restart_depends_on_the_state_alone():
-    config = HighLevelConfig(families=("rough", "gap"))
+@pytest.mark.parametrize("episodes", [True, False])
+def test_the_future_follows_from_the_state(episodes):
+    """That of episodes under way after ``forget``, which then end on the way; that of new ones
+    after ``restart``."""
+    config = HighLevelConfig(families=("rough", "gap"), episode_seconds=0.8)
     first = NavigationTask(config, LOW, 3, seed=1)
     second = NavigationTask(config, LOW, 3, seed=1)
     try:
         first.reset(np.arange(3))
         rng = np.random.default_rng(0)
-        for _ in range(2):
+        for _ in range(5):
             first.step(rng.uniform(-1, 1, (3, 13)))
-        second.load_state_dict(first.state_dict())
-        actions = rng.uniform(-1, 1, (2, 3, 13))
-        futures = []
+        first._next_push[0] = 0
+        first._push()
+        first.tiles.episodes[:] = 5  # so the next ones bring new tiles
+        state = first.state_dict()
+        if episodes:
+            first.forget()
+        else:
+            del state["episodes"]
+            first.restart()
+        second.load_state_dict(state)
+        actions = rng.uniform(-1, 1, (6, 3, 13))
+        futures, drawn = [], []
         for task in (first, second):
-            task.restart()
-            futures.append([task.step(a)[0] for a in actions] + [task.observe()])
+            drawn.append(task.tiles.drawn)
+            future = []
+            for a in actions:
+                reward, terminated, truncated = task.step(a)
+                done = np.flatnonzero(terminated | truncated)
+                task.reset(done)
+                future += [reward, terminated, task.observe()]
+            drawn.append(task.tiles.drawn)
+            futures.append(future)
         for a, b in zip(*futures, strict=True):
             assert np.array_equal(a, b)
+        assert drawn[:2] == drawn[2:] and (drawn[1] > drawn[0]) == episodes
     finally:
         first.close()
         second.close()
+
+
+def test_a_robot_that_blows_up_in_a_decision_is_seen_in_the_observation(task):
+    """Its low level has no action then; the decision goes on for the others."""
+    task.reset(np.arange(5))
+    task.locomotion.world.strength[1] = np.nan
+    with np.errstate(invalid="ignore"):
+        task.step(np.zeros((5, 13)))
+        finite = np.isfinite(task.observe()).all(axis=1)
+    assert finite.tolist() == [True, False, True, True, True]
 
 
 def test_bounds_outside_the_low_levels_training_are_refused():

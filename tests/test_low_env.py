@@ -16,8 +16,17 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 import tdgc.low_env as low_env
 from tdgc.commands import INDEX, default_command, gait_index
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
-from tdgc.low_env import CRITIC_LAYOUT, LowLevelEnv, LowLevelTask, is_fallen, shallow, summarise
+from tdgc.low_env import (
+    CRITIC_LAYOUT,
+    LowLevelEnv,
+    LowLevelTask,
+    is_fallen,
+    shallow,
+    straddling_frequency,
+    summarise,
+)
 from tdgc.robot import FOOT_RADIUS, Array, RobotState, nominal_pose, yaw_quaternion
+from tdgc.state import State, split
 from tdgc.terrain import make_tile, tile_rng
 
 NOMINAL = nominal_pose(RobotConfig())
@@ -190,6 +199,7 @@ def test_reset_gives_a_fresh_observation() -> None:
 
 def test_reward_of_a_step_is_that_of_its_terms() -> None:
     task = begin(PLANE, 2)
+    task.locomotion.command[:] = default_command()  # whose pose is the nominal one
     before = task.locomotion.world.state.qd.copy()
     actions = np.random.default_rng(0).normal(size=(2, 12))
     reward, _, _ = task.step(actions)
@@ -392,7 +402,8 @@ def test_commands_fill_their_ranges() -> None:
     assert (values[:, :12].max(axis=0) > bounds[:, 1] - 0.05 * width).all()
     standing = (values[:, :3] == 0.0).all(axis=1).mean()
     assert 0.05 < standing < 0.16
-    assert np.bincount(gait_index(values), minlength=4).min() > 100
+    # The rarest is trot: a fifth of the free commands that do not leap, 102 of 600 on average.
+    assert np.bincount(gait_index(values), minlength=4).min() > 75
     task.close()
 
 
@@ -408,7 +419,7 @@ def test_training_begins_with_a_share_of_the_velocity_ranges() -> None:
     values = np.array(drawn)
     paces = gait_index(values) == 2
     assert np.abs(values[~paces, 0]).max() <= 0.25 and np.abs(values[paces, 0]).max() > 0.7
-    assert np.abs(values[:, INDEX["body_height"]]).max() > 0.09  # others have their full range
+    assert np.abs(values[:, INDEX["body_height"]]).max() > 0.029  # others have their full range
     task.close()
 
 
@@ -620,14 +631,45 @@ def test_penalties_count_half_on_relief() -> None:
     assert share == pytest.approx(0.5, rel=1e-6)
 
 
+def test_timing_puts_landings_at_either_side_of_a_trench() -> None:
+    """The centre of the first trench is at 2.125 m; feet land 0.5 * 0.4 + 0.25 * 0.4 ahead."""
+
+    def frequency(x: float, clock: float) -> float:
+        one = np.ones(1)
+        args = (x * one, 1.0 * one, clock * one, 0.4 * one, 0.4 * one, 0.5 * one)
+        return float(straddling_frequency(*args)[0])
+
+    on_time = 2.125 - 0.2 - 0.3  # the trunk when the front feet land half a stride before it
+    assert frequency(on_time, 0.0) == pytest.approx(2.5)
+    assert frequency(on_time + 0.1, 0.25) == pytest.approx(2.5)  # a quarter of a cycle later
+    assert frequency(on_time + 0.4, 0.0) == pytest.approx(2.5)  # the landing behind it
+    assert frequency(on_time + 1.25, 0.0) == pytest.approx(2.5)  # before the next one
+    # Too far for its clock by a tenth of a stride: step sooner.
+    assert frequency(on_time + 0.04, 0.0) == pytest.approx(2.5 * 1.15)
+    assert frequency(on_time - 0.04, 0.0) == pytest.approx(2.5 * 0.85)
+
+
+def test_half_of_the_crossings_of_trenches_leap() -> None:
+    task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 400)
+    pronks = (gait_index(task.locomotion.command) == 1) & task._crossing
+    gap = task.column == 0
+    leaps = task._stride > 0.0
+    assert (leaps == (pronks & gap)).all()
+    assert 0.4 < leaps[gap & task._crossing].mean() < 0.6
+    assert (task._facing[leaps] == 0.0).all()
+    speed = np.hypot(*task.locomotion.command[leaps, :2].T)
+    assert speed.min() > 0.5 and speed.max() <= 1.0 + 1e-9
+    task.close()
+
+
 def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> None:
     task = begin(dataclasses.replace(TILES, families=("stair",)), 2)
     names = ("swing_height", "body_height", "pitch", "vx")
     columns = [INDEX[name] for name in names]
     for level, bounds in (
-        (0, [(0.08, 0.20), (-0.10, 0.10), (-0.3, 0.3), (-1.0, 1.0)]),
-        (5, [(0.12, 0.20), (-0.05, 0.10), (-0.195, 0.195), (-1.0, 1.0)]),
-        (10, [(0.16, 0.20), (0.0, 0.10), (-0.09, 0.09), (-1.0, 1.0)]),
+        (0, [(0.08, 0.20), (-0.03, 0.03), (-0.3, 0.3), (-1.0, 1.0)]),
+        (5, [(0.12, 0.20), (-0.015, 0.03), (-0.195, 0.195), (-1.0, 1.0)]),
+        (10, [(0.16, 0.20), (0.0, 0.03), (-0.09, 0.09), (-1.0, 1.0)]),
     ):
         task.level[:], task._crossing[:] = level, [True, False]
         low, high = task._bounds(np.array([0, 1]))
@@ -728,25 +770,65 @@ def live(task: LowLevelTask, steps: int) -> Array:
     return np.array(rows)
 
 
+def flat(state: State) -> dict[str, Any]:
+    """Arrays of a state by their place in it, as JSON has them."""
+    arrays: dict[str, Any] = {}
+    rest = split(state, "", arrays)
+    return {"rest": rest, **{name: array.tolist() for name, array in arrays.items()}}
+
+
 @pytest.mark.parametrize("config", [PLANE, TILES], ids=["plane", "tiles"])
-def test_a_restart_from_a_state_has_the_same_future(config: LowLevelConfig) -> None:
+def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
+    """In the middle of episodes, a moment after a push and with contacts; to the last bit."""
     config = dataclasses.replace(config, episode_seconds=1.0)  # some end on the way
     task = LowLevelTask(config, 3, seed=5)
     task.restart()
+    task.level[:] = [3, 1, 0]
     live(task, 40)
+    task.command_share[1] = 0.65
+    assert (task.elapsed > task._began).any()
+    task._next_push[0] = 0
+    task._push()
+    state = task.state_dict()
+    assert state["episodes"]["locomotion"]["foot_force"].max() > 1.0
+    kept = flat(state)
+    task.forget()
+    assert flat(task.state_dict()) == kept
+    expected = live(task, 60)
+    assert (expected[..., -2:] == 1.0).any()
+    assert flat(state) == kept  # a state is a copy
+
+    other = LowLevelTask(config, 3, seed=5)
+    for _ in range(2):  # it may have gone anywhere before
+        other.load_state_dict(state)
+        np.testing.assert_array_equal(live(other, 60), expected)
+        assert flat(other.state_dict()) == flat(task.state_dict())
+    task.close()
+    other.close()
+
+
+def test_new_episodes_begin_from_a_state_without_any() -> None:
+    """As checkpoints of version 1 have it, with lists for arrays."""
+    task, other = (LowLevelTask(PLANE, 3, seed=5) for _ in range(2))
     task.level[:] = [3, 1, 0]
     task.command_share[1] = 0.65
-    state = json.loads(json.dumps(task.state_dict()))
+    state = task.state_dict()
+    old = {
+        "rng": state["rng"], "tiles_drawn": 0,
+        "level": state["level"].tolist(), "command_share": state["command_share"].tolist(),
+    }  # fmt: skip
+    other.load_state_dict(json.loads(json.dumps(old)))
     task.restart()
-    expected = task.observe(), live(task, 60)
-    assert (expected[1][..., -2:] == 1.0).any()
-    other = LowLevelTask(config, 3, seed=5)
-    other.load_state_dict(state)
-    other.restart()
-    np.testing.assert_array_equal(other.observe(), expected[0])
-    np.testing.assert_array_equal(live(other, 60), expected[1])
-    assert other.state_dict() == task.state_dict()
-    assert other.command_share[1] == pytest.approx(0.65)
+    assert flat(other.state_dict()) == flat(task.state_dict())
+    np.testing.assert_array_equal(live(other, 3), live(task, 3))
+    task.close()
+    other.close()
+
+
+def test_a_state_of_other_robots() -> None:
+    task, other = LowLevelTask(PLANE, 2, seed=0), LowLevelTask(PLANE, 3, seed=0)
+    with pytest.raises(ValueError, match=r"^'level' has shape \(2,\), not \(3,\)$"):
+        other.load_state_dict(task.state_dict())
     task.close()
     other.close()
 

@@ -36,7 +36,7 @@ def write(folder: Path, conditions: Sequence[str] = ("nominal",), heading: float
                         shares = np.eye(4)[g if policy == "tdgc" else 0]
                         episodes.append(
                             Episode(
-                                policy, condition, family, level, k, 0, outcome, 9.5, 6.0,
+                                policy, condition, family, level, k, 0, outcome, 9.5, 6.0, 500.0,
                                 tuple(shares), tile.goal, straight(tile.start, way, heading, 9.5),
                             )
                         )  # fmt: skip
@@ -72,7 +72,7 @@ def test_gait_figure_is_half_and_half(tmp_path: Path) -> None:
     """tdgc: one family all trot, the other all pronk; gp: all trot."""
     plots.gait_shares(write(tmp_path), tmp_path / "gaits.png")
     pixels = picture(tmp_path / "gaits.png")
-    trot, pronk, pace, bound = (share_of(pixels, c) for c in plots._GAIT_COLOURS)
+    trot, pronk, pace, bound = (share_of(pixels, c) for c in plots.GAIT_COLOURS)
     # Three bars against one; the legend, which alone has the others, has as much of each.
     assert (trot - pace) / (pronk - pace) == pytest.approx(3.0, abs=0.1)
     assert 0.0 < bound < 0.1 * pronk
@@ -109,9 +109,8 @@ def test_heading_figure_turns_with_the_robots(tmp_path: Path) -> None:
 def test_heading_figure_of_robots_that_stand(tmp_path: Path) -> None:
     tile = tile_of(0, "gap", 6, 0)
     track = straight(tile.start, np.zeros(2), 0.0, 1.0)
-    still = Episode(
-        "gp", "nominal", "gap", 6, 0, 0, "timeout", 1.0, 0.0, (1.0, 0.0, 0.0, 0.0), tile.goal, track
-    )
+    where = ("gp", "nominal", "gap", 6, 0, 0)
+    still = Episode(*where, "timeout", 1.0, 0.0, 9.0, (1.0, 0.0, 0.0, 0.0), tile.goal, track)
     write_results(tmp_path, [still])
     plots.headings(tmp_path, tmp_path / "headings.png")
     picture(tmp_path / "headings.png")
@@ -123,7 +122,7 @@ def test_trajectory_figure_has_a_row_a_family_on_its_hardest_level(tmp_path: Pat
     assert pixels.shape[1] > 2 * pixels.shape[0]  # two rows of three tiles each for two policies
     width = pixels.shape[1]
     left, right = pixels[:, : int(0.45 * width)], pixels[:, int(0.52 * width) :]
-    blue, orange = plots._COLOURS["tdgc"], plots._COLOURS["gp"]
+    blue, orange = plots.POLICY_COLOURS["tdgc"], plots.POLICY_COLOURS["gp"]
     assert share_of(left, blue) > 0.002 > 0.0 == share_of(left, orange)
     assert share_of(right, orange) > 0.002 > 0.0 == share_of(right, blue)
 

@@ -42,6 +42,15 @@ COMMANDS: dict[str, str | None] = {
         "--out {tmp}/evaluation"
     ),
     "python evaluate.py --tracking": "--episodes 1 --workers 1 --out {tmp}/tracking",
+    "python evaluate.py --trace failed": (
+        "--policies gp --levels 10 --families gap --episodes 1 --workers 1 --out {tmp}/trace"
+    ),
+    "python evaluate.py --policies tdgc --set decoder.vx.high=0.6 --set safety.max_tilt=0.5": (
+        "--levels 0 --families rough --episodes 1 --workers 1 --out {tmp}/tune"
+    ),
+    "python evaluate.py --video --families stair,gap --levels 8": (
+        "--policies gp --levels 10 --families gap --episodes 1 --workers 1 --out {tmp}/video"
+    ),
     "python -m tdgc.bench --out runs/bench": (
         "--robots 2 --workers 1 --seconds 0.1 --out {tmp}/bench"
     ),
@@ -60,6 +69,11 @@ OUTPUTS = (
     "evaluation/summary.json",
     "evaluation/success.png",
     "tracking/tracking.json",
+    "trace/diagnosis.csv",
+    "trace/traces/gp_nominal_gap_10_000.parquet",
+    "tune/tuning.json",
+    "video/films/film_gp_nominal_gap_10_000.mp4",
+    "video/films/strip_gap_10.png",
     "bench/bench.json",
 )
 PROGRAMS = {

@@ -11,12 +11,14 @@ import numpy as np
 import pybullet
 import pytest
 
+from tdgc.commands import INDEX, default_command
 from tdgc.config import ConfigError, RobotConfig
 from tdgc.gaits import FEET
 from tdgc.robot import (
     ABDUCTION,
     CALF,
     FOOT_RADIUS,
+    HIGHEST_FOOT,
     HIP_X,
     HIP_Y,
     HIPS_XY,
@@ -26,8 +28,10 @@ from tdgc.robot import (
     TRUNK_MASS,
     Array,
     RobotState,
+    commanded_pose,
     foot_kinematics,
     joint_targets,
+    leg_angles,
     nominal_pose,
     pd_torque,
     rotation_matrix,
@@ -201,10 +205,64 @@ def test_nominal_pose_stands_at_about_the_stated_height() -> None:
 def test_joint_targets_scale_and_clip() -> None:
     actions = np.zeros((3, 12))
     actions[1], actions[2] = 2.0, -100.0
-    moved = joint_targets(CONFIG, actions) - nominal_pose(CONFIG)
+    pose = np.tile(nominal_pose(CONFIG), (3, 1))
+    moved = joint_targets(CONFIG, pose, actions) - pose
     assert (moved[0] == 0.0).all()
     np.testing.assert_allclose(moved[1], np.tile([0.25, 0.5, 0.5], 4), atol=1e-12)
     np.testing.assert_allclose(moved[2], np.tile([-0.5, -1.0, -1.0], 4), atol=1e-12)
+
+
+def commands(n: int, **changed: float) -> Array:
+    """Default commands (n, 15) but for those named."""
+    command = np.tile(default_command(), (n, 1))
+    for name, value in changed.items():
+        command[:, INDEX[name]] = value
+    return command
+
+
+def test_leg_angles_invert_the_kinematics() -> None:
+    rng = np.random.default_rng(0)
+    q = nominal_pose(CONFIG) + rng.uniform(-0.5, 0.5, (200, 12))
+    feet, _ = foot_kinematics(q, np.zeros_like(q))
+    np.testing.assert_allclose(leg_angles(feet), q, atol=1e-12)
+
+
+def test_leg_angles_point_at_feet_out_of_reach() -> None:
+    side = np.sign(HIPS_XY[:, 1])
+    under = np.column_stack([HIPS_XY[:, 0], HIPS_XY[:, 1] + ABDUCTION * side, np.full(4, -0.6)])
+    angles = leg_angles(under[None])
+    np.testing.assert_allclose(angles.reshape(4, 3)[:, 2], -0.89)
+    reached, _ = foot_kinematics(angles, np.zeros((1, 12)))
+    length = math.sqrt(THIGH**2 + CALF**2 + 2.0 * THIGH * CALF * math.cos(0.89))
+    under[:, 2] = -length
+    np.testing.assert_allclose(reached[0], under, atol=1e-12)
+
+
+def test_commanded_pose_is_the_papers_at_default_commands() -> None:
+    swing = np.random.default_rng(0).uniform(size=(5, 4))
+    pose = commanded_pose(CONFIG, commands(5, vx=0.7, pitch=0.2, frequency=2.0), swing)
+    np.testing.assert_allclose(pose, np.tile(nominal_pose(CONFIG), (5, 1)), atol=1e-12)
+
+
+def test_commanded_pose_puts_feet_where_commands_say() -> None:
+    rest, _ = foot_kinematics(nominal_pose(CONFIG)[None], np.zeros((1, 12)))
+    swing = np.array([[1.0, 0.0, 0.5, 0.0]])
+    command = commands(
+        1, body_height=-0.05, stance_width=0.31, stance_length=0.40, swing_height=0.18
+    )
+    pose = commanded_pose(CONFIG, command, swing)
+    feet, _ = foot_kinematics(pose, np.zeros((1, 12)))
+    moved = (feet - rest)[0]
+    np.testing.assert_allclose(moved[:, 0], [0.01, 0.01, -0.01, -0.01], atol=1e-9)
+    np.testing.assert_allclose(moved[:, 1], [0.03, -0.03, 0.03, -0.03], atol=1e-9)
+    np.testing.assert_allclose(moved[:, 2], [0.15, 0.05, 0.10, 0.05], atol=1e-9)
+
+
+def test_commanded_pose_folds_no_leg_further_than_its_limit() -> None:
+    command = commands(1, body_height=-0.1, swing_height=0.20)
+    pose = commanded_pose(CONFIG, command, np.ones((1, 4)))
+    feet, _ = foot_kinematics(pose, np.zeros((1, 12)))
+    np.testing.assert_allclose(feet[0, :, 2], HIGHEST_FOOT, atol=1e-9)
 
 
 def torque(error: float, speed: float, strength: float = 1.0) -> list[float]:

@@ -36,6 +36,7 @@ from tdgc.training import (
     read_checkpoint,
     save_checkpoint,
     snapshot,
+    workers_of,
 )
 from tdgc.vec import worker_seed
 
@@ -78,13 +79,17 @@ def draw() -> tuple[float, float, float]:
 def test_checkpoint_round_trip(tmp_path: Path) -> None:
     model = learner(seed=1)
     np.random.normal()  # so that numpy holds back the second of a pair
-    path = save_checkpoint(tmp_path, *snapshot(model, {"workers": [{"epoch": 3}], "phase": 1}))
+    position = np.random.normal(size=(4, 3))
+    state = {"epoch": 3, "robots": {"position": position}}
+    path = save_checkpoint(tmp_path, *snapshot(model, {"workers": [state], "phase": 1}))
     assert path == tmp_path / "step-000000000032"
     saved, drawn = parameters(model), draw()
     other = learner(seed=2, steps=16)
     assert any((saved[k] != v).any() for k, v in parameters(other).items())
     tensors, header = read_checkpoint(path)
-    assert header["workers"] == [{"epoch": 3}] and header["phase"] == 1
+    (worker,) = workers_of(tensors, header)
+    assert worker["epoch"] == 3 and header["phase"] == 1
+    np.testing.assert_array_equal(worker["robots"]["position"], position)
     load_learner(other, tensors, header)
     loaded = parameters(other)
     assert set(loaded) == set(saved) and "0.exp_avg_sq" in saved
@@ -143,7 +148,7 @@ def listed(path: Path) -> None:
 
 def newer(path: Path) -> None:
     header = json.loads((path / "state.json").read_text(encoding="utf-8"))
-    (path / "state.json").write_text(json.dumps({**header, "version": 2}), encoding="utf-8")
+    (path / "state.json").write_text(json.dumps({**header, "version": 3}), encoding="utf-8")
 
 
 def remove(path: Path) -> None:
@@ -268,7 +273,7 @@ def test_the_policy_is_symmetric(tmp_path: Path) -> None:
 
 TINY = [
     "--seed", "3", "--n-envs", "4", "--workers", "2", "--steps", "160",
-    "--set", "plane_steps=64", "--set", "checkpoint_steps=32", "--set", "log_steps=64",
+    "--set", "plane_steps=64", "--set", "checkpoint_seconds=0", "--set", "log_steps=64",
     "--set", "ppo.n_steps=8", "--set", "ppo.batch_size=16", "--set", "ppo.n_epochs=2",
     "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.4",
     "--set", "env.physics.substeps=4",
@@ -288,14 +293,15 @@ def at_calls(monkeypatch: pytest.MonkeyPatch, act: Callable[[int, Interruption],
     monkeypatch.setattr(Interruption, "due", due)
 
 
-def kill_run(script: str, arguments: list[str], last: Path) -> None:
-    """Start a run and kill it as soon as the checkpoint ``last`` is there."""
+def kill_run(script: str, arguments: list[str], last: Path, after: float = 0.0) -> None:
+    """Start a run and kill it ``after`` so many seconds since the checkpoint ``last`` is there."""
     process = subprocess.Popen(
         [sys.executable, script, *arguments],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
     while process.poll() is None and not last.exists():
         time.sleep(0.01)
+    time.sleep(after)
     process.kill()
     output, _ = process.communicate(timeout=300.0)  # which the workers hold open, too
     assert process.returncode == -signal.SIGKILL, output.decode()
@@ -320,26 +326,38 @@ def rows(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
 
 
-def test_a_killed_and_resumed_run_ends_as_one_that_never_stopped(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Two updates on the plane and three on tiles, a checkpoint after each. The second run is
-    killed after three, loses its newest checkpoint, and goes on from the one before."""
+    """Two updates on the plane and three on tiles, in the middle of episodes. The first run writes
+    no checkpoint on its way. The second is stopped after the first update, killed on tiles, loses
+    its newest checkpoint, and goes on from the one before."""
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    assert train_low.main([*TINY, "--out", str(whole)]) == 0
+    assert train_low.main([*TINY, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     names = sorted(path.name for path in (whole / "checkpoints").iterdir())
-    assert names == ["step-000000000128", "step-000000000160"]
+    assert names == ["step-000000000064", "step-000000000160"]  # the ends of both phases
     assert [row["steps"] for row in rows(whole)] == [64, 128]
     assert rows(whole)[1]["reward/track_lin_vel"] > 0.0 and "level/stair" in rows(whole)[1]
     stored = from_dict(LowTrainConfig, json.loads((whole / "config.json").read_text()))
     expected = LowTrainConfig(
-        seed=3, n_envs=4, workers=2, steps=160, plane_steps=64, checkpoint_steps=32, log_steps=64
+        seed=3, n_envs=4, workers=2, steps=160, plane_steps=64, checkpoint_seconds=1e6, log_steps=64
     )
     assert dataclasses.replace(stored, env=expected.env, ppo=expected.ppo) == expected
     assert stored.ppo.actor == (8,) and stored.env.episode_seconds == 0.4
 
+    def stop(call: int, interruption: Interruption) -> None:
+        if call == 2:
+            interruption.reason = "the test"
+
+    with monkeypatch.context() as patch:
+        at_calls(patch, stop)
+        assert train_low.main([*TINY, "--out", str(broken)]) == 0
+    stopped = read_checkpoint(newest(broken))
+    assert stopped[1]["num_timesteps"] == 32 and stopped[1]["phase"] == 0
+    under_way = [state["lengths"] for state in workers_of(*stopped)]
+    assert 0 < np.max(under_way) < 20  # of episodes of 20 steps
     last = broken / "checkpoints/step-000000000096"
-    kill_run("train_low.py", [*TINY, "--out", str(broken)], last)
+    kill_run("train_low.py", ["--resume", "--out", str(broken)], last)
     assert weights(broken) != weights(whole)
     flip(newest(broken))
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
@@ -354,22 +372,58 @@ def test_a_killed_and_resumed_run_ends_as_one_that_never_stopped(
 def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Five updates of the recurrent learner with a checkpoint after each, killed after three."""
+    """Five updates of the recurrent learner, which remembers the episodes under way. The second run
+    has a checkpoint after each and is killed in the middle of the fourth's rollout."""
     arguments = [
         "--seed", "3", "--n-envs", "2", "--workers", "1", "--steps", "40",
-        "--set", "checkpoint_steps=8", "--set", "log_steps=16", "--set", "ppo.n_steps=4",
+        "--set", "checkpoint_seconds=0", "--set", "log_steps=16", "--set", "ppo.n_steps=4",
         "--set", "ppo.minibatches=2", "--set", "ppo.n_epochs=2", "--set", "ppo.lstm=8",
-        "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.6",
+        "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.7",
     ]  # fmt: skip
     monkeypatch.chdir(ROOT)  # the shipped low level is named from there
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    assert train_high.main([*arguments, "--out", str(whole)]) == 0
+    assert (
+        train_high.main([*arguments, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
+    )
     assert [row["steps"] for row in rows(whole)] == [16, 32]
     last = broken / "checkpoints/step-000000000024"
-    kill_run("train_high.py", [*arguments, "--out", str(broken)], last)
-    assert newest(broken) < newest(broken).with_name("step-000000000040")
+    kill_run("train_high.py", [*arguments, "--out", str(broken)], last, after=0.05)
+    tensors, header = read_checkpoint(newest(broken))
+    assert header["num_timesteps"] < 40
+    (state,) = workers_of(tensors, header)
+    assert state["lengths"].max() > 0  # episodes have 7 decisions, so the third update cuts them
+    assert tensors["lstm.pi.h"].any()
     assert train_high.main(["--resume", "--out", str(broken)]) == 0
     assert final(broken) == final(whole)
+
+
+def test_a_run_of_version_1_goes_on(tmp_path: Path) -> None:
+    """Its checkpoints have no episodes and lists for arrays, its configuration counts steps."""
+    arguments = [*TINY, "--steps", "64", "--set", "plane_steps=0", "--out", str(tmp_path)]
+    assert train_low.main(arguments) == 0
+    tensors, header = read_checkpoint(newest(tmp_path))
+    states = workers_of(tensors, header)
+    header |= {"version": 1, "workers": [
+        {
+            **{key: state[key] for key in ("rng", "tiles_drawn", "restarts")},
+            "level": [7, 8], "command_share": state["command_share"].tolist(),
+        }
+        for state in states
+    ]}  # fmt: skip
+    tensors = {k: v for k, v in tensors.items() if not k.startswith("extra.")}
+    save_checkpoint(tmp_path / "checkpoints", tensors, header)
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["checkpoint_seconds"]
+    (tmp_path / "config.json").write_text(json.dumps({**config, "checkpoint_steps": 200}))
+    assert train_low.main(["--resume", "--steps", "96", "--out", str(tmp_path)]) == 0
+    tensors, header = read_checkpoint(newest(tmp_path))
+    assert (header["num_timesteps"], header["version"]) == (96, 2)
+    after = workers_of(tensors, header)
+    assert all(np.abs(state["level"] - [7, 8]).max() <= 1 for state in after)
+    assert [s["tiles_drawn"] > t["tiles_drawn"] for s, t in zip(after, states, strict=True)] == [
+        True, True
+    ]  # fmt: skip
+    assert json.loads((tmp_path / "config.json").read_text())["checkpoint_seconds"] == 30.0
 
 
 def test_faults_of_a_run(
@@ -378,7 +432,7 @@ def test_faults_of_a_run(
     """A full disk, a killed worker, a stop; then workers that are killed again and again."""
     arguments = [
         *TINY, "--n-envs", "2", "--workers", "1", "--steps", "160", "--out", str(tmp_path),
-        "--set", "plane_steps=1000", "--set", "checkpoint_steps=16", "--set", "log_steps=16",
+        "--set", "plane_steps=1000", "--set", "checkpoint_seconds=0", "--set", "log_steps=16",
     ]  # fmt: skip
     full = contextlib.ExitStack()
 

@@ -1,7 +1,6 @@
 """Worker processes: what they compute is what the tasks compute, and how they fail."""
 
 import functools
-import json
 import multiprocessing
 import os
 import signal
@@ -15,6 +14,7 @@ import pytest
 from tdgc.config import LowLevelConfig, PhysicsConfig
 from tdgc.low_env import LowLevelTask
 from tdgc.robot import Array
+from tdgc.state import State, split
 from tdgc.vec import TaskVecEnv, WorkerError, worker_seed
 
 CONFIG = LowLevelConfig(episode_seconds=0.5, physics=PhysicsConfig(substeps=4))
@@ -67,12 +67,19 @@ class Counter:
     def take_stats(self) -> dict[str, float]:
         return {"robots": float(self.num_robots), "worlds": float(self.worlds)}
 
-    def state_dict(self) -> dict[str, Any]:
-        rng = self.rng.bit_generator.state
-        return {"seed": self.seed, "worlds": self.worlds, "rng": rng}
+    def forget(self) -> None:
+        pass
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def state_dict(self) -> State:
+        rng, episodes = self.rng.bit_generator.state, {"steps": self.steps.copy()}
+        return {"seed": self.seed, "worlds": self.worlds, "rng": rng, "episodes": episodes}
+
+    def load_state_dict(self, state: State) -> None:
         self.worlds = state["worlds"]
+        if "episodes" in state:
+            self.steps = state["episodes"]["steps"].copy()
+        else:
+            self.restart()
 
     def close(self) -> None:
         pass
@@ -129,17 +136,45 @@ def test_workers_compute_what_the_tasks_do() -> None:
                 ends += 1
     assert ends > 2
     states = env.state_dicts()
-    expected_states = [{**task.state_dict(), "restarts": 0} for task in tasks]
-    assert json.loads(json.dumps(states)) == expected_states
-    # Loading them into other workers gives the same future.
-    for task in tasks:
+    for state, task in zip(states, tasks, strict=True):
+        arrays: tuple[dict[str, Any], dict[str, Any]] = {}, {}
+        rest, expected_rest = split(state, "", arrays[0]), split(task.state_dict(), "", arrays[1])
+        assert rest == {
+            **expected_rest, "restarts": 0,
+            **{name: {"array": f".{name}"} for name in ("obs", "returns", "lengths")},
+        }  # fmt: skip
+        for name, array in arrays[1].items():
+            np.testing.assert_array_equal(arrays[0][name], array, err_msg=name)
         task.close()
-    observation = env.reset()
-    futures = [observation, *(env.step(np.full((4, 12), 0.1))[0] for _ in range(3))]
-    env.load_state_dicts(states)
-    again = [env.reset(), *(env.step(np.full((4, 12), 0.1))[0] for _ in range(3))]
-    np.testing.assert_array_equal(again, futures)
     env.close()
+
+
+def steps(env: TaskVecEnv, number: int) -> list[Any]:
+    """What steps with one and the same action give."""
+    gone = [env.step(np.full((4, 12), 0.3, np.float32)) for _ in range(number)]
+    return [(o.tolist(), r.tolist(), d.tolist(), str(infos)) for o, r, d, infos in gone]
+
+
+def test_other_workers_go_on_from_the_states() -> None:
+    """In the middle of episodes, some of which end: the same observations, noise and all, rewards,
+    ends and returns."""
+    probe = make_robots(1, 0)
+    spaces = probe.observation_space, probe.action_space
+    probe.close()
+    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
+    env.reset()
+    steps(env, 10)
+    env.forget()
+    states, seen, starts = env.state_dicts(), env.seen(), env.starts()
+    future = steps(env, 20)
+    env.close()
+    assert sum(sum(done) for *_, done, _ in future) > 0 and "episode" in str(future)
+    other = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
+    other.load_state_dicts(states)
+    np.testing.assert_array_equal(other.seen(), seen)
+    np.testing.assert_array_equal(other.starts(), starts)
+    assert steps(other, 20) == future
+    other.close()
 
 
 def test_ends_of_episodes(counters: TaskVecEnv) -> None:
@@ -192,11 +227,14 @@ def test_statistics_and_states_of_each_worker(counters: TaskVecEnv) -> None:
     states = counters.state_dicts()
     assert [s["seed"] for s in states] == [worker_seed(3, 0), worker_seed(3, 1)]
     assert [s["restarts"] for s in states] == [0, 0]
+    counters.step(np.ones((5, 2), dtype=np.float32))
     counters.load_state_dicts([{"worlds": 50}, {"worlds": 60}])  # as old checkpoints have them
-    counters.reset()
     assert [s["worlds"] for s in counters.stats()] == [51.0, 61.0]
+    assert counters.starts().all() and (counters.seen()[:, 1:] == 0.0).all()
     with pytest.raises(ValueError, match=r"^states of 1 workers do not fit 2$"):
         counters.load_state_dicts(states[:1])
+    with pytest.raises(ValueError, match=r"^a state of 3 robots does not fit 2$"):
+        counters.load_state_dicts(states[::-1])
 
 
 def test_what_a_batched_world_cannot_answer(counters: TaskVecEnv) -> None:

@@ -334,6 +334,8 @@ def test_push_adds_a_velocity() -> None:
     world.push([1], np.array([[0.4, -0.3, 0.1]]))
     linear, angular = world._client_of[1].getBaseVelocity(world._bodies[1])
     np.testing.assert_allclose(linear, before[1] + [0.4, -0.3, 0.1], atol=1e-12)
+    assert world.state.lin_vel[1].tolist() == list(linear)
+    assert world.state.heading_vel[1].tolist() == pytest.approx(linear)
     np.testing.assert_allclose(angular, 0.0, atol=1e-12)
     hold(world)
     change = world.state.lin_vel - before - [0.0, 0.0, -G * 0.02]
@@ -499,6 +501,55 @@ def trajectory(
         rows.append(snapshot(world)[robot])
     world.close()
     return np.array(rows)
+
+
+@pytest.mark.parametrize("terrain", [False, True])
+def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> None:
+    """Robots that stumble about, in two clients, to the last bit; else they do not."""
+    m, rng = CLIENT_ROBOTS + 1, np.random.default_rng(0)
+    field = tiles((["rough", "stair", "gap"] * m)[:m], level=6) if terrain else None
+    world = World(m, ROBOT, PHYSICS, field)
+    xy = np.column_stack([np.arange(m), np.zeros(m)])
+    if field is not None:
+        xy = field.origin(np.arange(m), 0) + np.array([3.0, 4.0])
+    ground = world.ground_height(xy[:, 0], xy[:, 1])
+    pose, upright = np.tile(NOMINAL, (m, 1)), yaw_quaternion(rng.uniform(-3, 3, m))
+    world.reset_robots(np.arange(m), np.column_stack([xy, ground + STAND + 0.1]), upright, pose)
+    world.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0))
+
+    def stumble(worlds: list[World], steps: int) -> bool:
+        """Whether all of them do the same."""
+        alike = True
+        for _ in range(steps):
+            targets = NOMINAL + rng.uniform(-0.6, 0.6, (3, m, 12))
+            for each in worlds:
+                each.step(targets, np.linspace(0.0, 0.03, m), np.zeros((m, 12)))
+            alike &= all((snapshot(each) == snapshot(worlds[0])).all() for each in worlds)
+        return alike
+
+    def anew() -> World:
+        other = World(m, ROBOT, PHYSICS, field)
+        other.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0))
+        for name in ("position", "quaternion", "lin_vel", "ang_vel", "q", "qd"):
+            getattr(other.state, name)[:] = getattr(world.state, name)
+        other.state.derive()
+        other.forget()
+        return other
+
+    for _ in range(3):
+        stumble([world], 15)
+        world.push([0], np.array([[0.5, 0.0, 0.0]]))
+        assert (world.state.foot_force > 0.0).any()
+        before = snapshot(world)
+        world.forget()
+        assert (snapshot(world) == before).all()
+        other = anew()
+        assert stumble([world, other], 10)
+        other.close()
+    other = anew()
+    assert not stumble([world, other], 10)
+    other.close()
+    world.close()
 
 
 @pytest.mark.parametrize("robots", [5, 11])

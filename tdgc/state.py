@@ -1,0 +1,63 @@
+"""States to go on from: nested dicts of arrays and of what JSON can hold.
+
+What has a state gives copies of its arrays, and takes them back in place with ``fill``. A
+checkpoint keeps the arrays and the rest in two files, see ``split`` and ``join``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+State = dict[str, Any]
+_PLACE = "array"  # the only key of what stands where ``split`` took an array out
+
+
+def fill(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> None:
+    """Copy the values of ``state`` into the arrays of the same names, in place.
+
+    Raises:
+        ValueError: a name that the state lacks, or another shape.
+    """
+    for name, array in arrays.items():
+        if name not in state:
+            raise ValueError(f"the state lacks '{name}'")
+        value = np.asarray(state[name])
+        if value.shape != array.shape:
+            raise ValueError(f"'{name}' has shape {value.shape}, not {array.shape}")
+        array[...] = value
+
+
+def copies(arrays: Mapping[str, NDArray[Any]]) -> State:
+    """The same names with copies of the arrays."""
+    return {name: array.copy() for name, array in arrays.items()}
+
+
+def split(tree: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
+    """``tree`` with its arrays moved to ``arrays``, named by their place under ``path``."""
+    if isinstance(tree, np.ndarray):
+        arrays[path] = tree
+        return {_PLACE: path}
+    if isinstance(tree, dict):
+        return {key: split(value, f"{path}.{key}", arrays) for key, value in tree.items()}
+    if isinstance(tree, list):
+        return [split(value, f"{path}.{k}", arrays) for k, value in enumerate(tree)]
+    return tree
+
+
+def join(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """What ``split`` took apart.
+
+    Raises:
+        KeyError: an array that is missing.
+    """
+    if isinstance(tree, dict):
+        if tree.keys() == {_PLACE}:
+            return arrays[tree[_PLACE]]
+        return {key: join(value, arrays) for key, value in tree.items()}
+    if isinstance(tree, list):
+        return [join(value, arrays) for value in tree]
+    return tree

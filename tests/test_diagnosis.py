@@ -1,0 +1,304 @@
+"""Diagnosis: planted faults are blamed on their layer; each rule; the summary's numbers."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tdgc import diagnosis, drivers
+from tdgc.commands import INDEX
+from tdgc.diagnosis import LIMITS, Diagnosis, describe, diagnose, features, place_of
+from tdgc.drivers import HierarchyDriver, load_high
+from tdgc.evaluation import Cell, Episode, run_cell, tile_of
+from tdgc.high_env import PRETRAINED, PROBES, load_low
+from tdgc.locomotion import Locomotion
+from tdgc.robot import Array
+from tdgc.trace import COLUMNS, Trace, Tracer
+
+
+@pytest.fixture(scope="module")
+def low():
+    return load_low(PRETRAINED / "low")
+
+
+@pytest.fixture(scope="module")
+def pair(low):
+    return load_high(PRETRAINED / "high", *low)
+
+
+# ------------------------------------------------------------------ planted faults
+
+SEED = 11  # none of those that the limits were measured on
+
+
+def blamed(driver: HierarchyDriver, low: Any, cells: list[tuple[str, int, int]]) -> list[str]:
+    """The layers that are blamed for the failures of (family, level, episodes)."""
+    layers = []
+    for family, level, count in cells:
+        tracer = Tracer(driver, SEED)
+        run_cell(Cell("tdgc", "nominal", family, level, 0, count), low, driver, SEED, tracer)
+        failures = [t for t in tracer.traces() if t.outcome != "reached"]
+        layers += [diagnose(t).layer for t in failures]
+    return layers
+
+
+class WeakMotor(HierarchyDriver):
+    """One motor of every robot has lost its strength."""
+
+    joint = 0
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        super().begin(loco, goal, family)
+        loco.world.strength = np.ones((loco.num_robots, 12))
+        loco.world.strength[:, self.joint] = 0.02
+
+
+class Blindfold(HierarchyDriver):
+    """The high level sees flat ground of an unknown family and a goal where there is none."""
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        angle = np.random.default_rng(0).uniform(-np.pi, np.pi, loco.num_robots)
+        here = loco.world.state.position[:, :2]
+        c, s = np.cos(angle), np.sin(angle)
+        x, y = (goal - here).T
+        super().begin(loco, here + np.stack([c * x - s * y, s * x + c * y], axis=1), "mixed")
+
+    def command(self, step: int) -> Array:
+        def blind(*arguments: Any) -> Any:
+            observation = observe(*arguments)
+            observation[:, -len(PROBES) :] = 0.0
+            return observation
+
+        observe = drivers.observe_high
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(drivers, "observe_high", blind)
+            return super().command(step)
+
+
+@pytest.mark.parametrize("joint", [2, 10])  # a front calf, a rear thigh
+def test_a_broken_motor_is_the_executions_fault(joint, low, pair):
+    driver = WeakMotor(*pair)
+    driver.joint = joint
+    layers = blamed(driver, low[0], [("rough", 4, 4), ("pillar", 4, 2)])
+    assert len(layers) >= 3 and layers.count("execution") >= 0.8 * len(layers)
+
+
+@pytest.mark.parametrize("command", ["vx", "yaw_rate"])
+def test_swapped_bounds_of_a_decoder_are_the_decisions_fault(command, low, pair):
+    driver = HierarchyDriver(*pair)
+    decoder, j = driver._decoder, INDEX[command]
+    decoder.low[j], decoder.high[j] = decoder.high[j], decoder.low[j]
+    layers = blamed(driver, low[0], [("rough", 4, 3), ("pillar", 4, 3)])
+    assert len(layers) >= 3 and layers.count("decisions") >= 0.8 * len(layers)
+
+
+def test_a_blindfold_is_the_decisions_fault(low, pair):
+    layers = blamed(Blindfold(*pair), low[0], [("rough", 4, 4), ("pillar", 6, 4)])
+    assert len(layers) >= 3 and layers.count("decisions") >= 0.8 * len(layers)
+
+
+# ------------------------------------------------------------------ the rules, one by one
+
+
+def walk(
+    family: str = "rough",
+    level: int = 6,
+    outcome: str = "left_tile",
+    seconds: float = 6.0,
+    track: tuple[tuple[float, float], tuple[float, float]] = ((0.8, 4.0), (5.0, 4.0)),
+    **columns: float,
+) -> Trace:
+    """A trace of a straight walk from one end of ``track`` to the other, with constant columns.
+
+    Not given, the goal lies straight ahead and every command is tracked.
+    """
+    n = round(10 * seconds) + 1
+    way = np.linspace(0.0, 1.0, n)
+    values: dict[str, Any] = {
+        c.name: np.zeros(n, np.float32) if c.unit else np.full(n, None, object) for c in COLUMNS
+    }
+    values["time"] = np.linspace(0.0, seconds, n, dtype=np.float32)
+    values["seconds"][1:] = 0.1
+    values["base_x"] = track[0][0] + way * (track[1][0] - track[0][0])
+    values["base_y"] = track[0][1] + way * (track[1][1] - track[0][1])
+    for name, value in ({"command_vx": 0.5} | columns).items():
+        values[name][:] = value
+    return Trace("tdgc", "nominal", family, level, 0, 0, outcome, values)
+
+
+def verdict(trace: Trace) -> tuple[str, str]:
+    found = diagnose(trace)
+    return found.layer, found.cause
+
+
+def test_what_nothing_was_trained_on_is_the_terrains_fault():
+    assert verdict(walk(level=11, outcome="fell")) == ("terrain", "never trained on")
+    assert verdict(walk(family="mixed", error_vx=-2.0)) == ("terrain", "never trained on")
+    assert verdict(walk(level=10, outcome="fell"))[0] == "execution"
+
+
+def test_errors_beyond_the_limits_are_the_executions_fault():
+    limit = LIMITS["velocity"].stretch
+    assert verdict(walk(error_vx=-limit - 0.01)) == ("execution", "lost track of velocity")
+    assert verdict(walk(error_vx=-limit + 0.01)) == ("decisions", "steered off the tile")
+    assert verdict(walk(error_vx=0.8 * limit, error_vy=0.8 * limit))[0] == "execution"  # a vector
+    limit = LIMITS["yaw rate"].stretch
+    assert verdict(walk(error_yaw_rate=limit + 0.01)) == ("execution", "lost track of yaw rate")
+    both = walk(error_pitch=LIMITS["tilt"].stretch + 0.01, error_yaw_rate=-limit - 0.01)
+    assert verdict(both) == ("execution", "lost track of yaw rate and tilt")
+
+
+def test_a_timeout_is_judged_by_all_of_it_and_other_ends_by_their_last_seconds():
+    early = walk(outcome="timeout", seconds=20.0)
+    early["error_vx"][11:60] = -0.9  # over 5 of 19 s: 0.23 m/s on average
+    assert verdict(early) == ("execution", "lost track of velocity")
+    assert verdict(dataclasses.replace(early, outcome="left_tile"))[0] == "decisions"
+    late = walk(seconds=20.0)
+    late["error_vx"][-20:] = -0.5  # over the last 2 of 19 s: 0.05 m/s
+    assert verdict(late) == ("execution", "lost track of velocity")
+    late = dataclasses.replace(late, outcome="timeout")
+    assert verdict(late) == ("decisions", "found no way to the goal")
+
+
+def test_speeding_up_from_rest_does_not_count():
+    start = walk(seconds=1.5)
+    start["error_vx"][1:11] = -1.0
+    assert verdict(start)[0] == "decisions"
+    short = diagnose(walk(seconds=0.8, error_vx=-1.0))
+    assert short.layer == "decisions" and "tracking not judged" in short.evidence
+
+
+def test_a_fall_is_the_executions_fault_unless_the_command_led_elsewhere():
+    on_the_way = ("execution", "lost its footing on the way to the goal")
+    elsewhere = ("decisions", "lost its footing on the way elsewhere")
+    for outcome in ("fell", "collided"):  # the trunk hits a step just as it hits the ground
+        assert verdict(walk("stair", outcome=outcome)) == on_the_way
+        assert verdict(walk("stair", outcome=outcome, goal_bearing=2.0)) == elsewhere
+        assert verdict(walk("stair", outcome=outcome, command_vx=-0.5)) == elsewhere
+
+
+def pillar_at() -> tuple[float, float]:
+    tile = tile_of(0, "pillar", 6, 0)
+    ix, iy = np.argwhere(tile.heights > 0.4)[0]  # the one nearest to the start
+    return 0.05 * ix, 0.05 * iy
+
+
+def test_a_pillar_in_the_way_is_the_decisions_fault():
+    x, y = pillar_at()
+    into = ((x - 1.0, y), (x - 0.25, y))
+    hit = diagnose(walk("pillar", outcome="collided", track=into))
+    assert (hit.layer, hit.cause) == ("decisions", "steered into a pillar")
+    assert hit.feature == f"0.25 m from pillar at ({x:.1f}, {y:.1f}) m"
+    # Pushing against it, the robot tracks nothing; that tells nothing of the low level.
+    pushing = walk("pillar", outcome="timeout", track=((x - 0.3, y), (x - 0.3, y)), error_vx=-0.5)
+    assert verdict(pushing) == ("decisions", "held up by a pillar")
+    # On the same tile, away from all pillars, it does.
+    away = walk("pillar", outcome="timeout", track=((0.8, 4.0), (1.0, 4.0)), error_vx=-0.5)
+    assert verdict(away) == ("execution", "lost track of velocity")
+
+
+def test_tipping_over_the_edge_does_not_count():
+    off = walk(seconds=4.0, track=((4.0, 1.6), (4.0, 0.0)))
+    off["error_roll"][off["base_y"] < 0.15] = 2.0
+    assert verdict(off) == ("decisions", "steered off the tile")
+    off["error_roll"][off["base_y"] < 0.6] = 2.0
+    assert verdict(off)[0] == "execution"
+
+
+def test_an_episode_that_succeeded_has_no_diagnosis():
+    with pytest.raises(ValueError, match="has not failed"):
+        diagnose(walk(outcome="reached"))
+
+
+def test_evidence_gives_the_numbers():
+    found = diagnose(walk(error_vx=0.3, error_vy=0.4, at_bound_yaw_rate=-1.0))
+    assert found.evidence == (
+        "in the last 2 s: velocity off by 0.50 m/s (limit 0.43); yaw rate off by 0.00 rad/s "
+        "(limit 0.29); tilt off by 0.00 rad (limit 0.39); asked for +0.50 m/s towards the goal; "
+        "yaw_rate at its bound 100 % of the time"
+    )
+    assert (found.time_s, found.place, found.seed) == (6.0, "zone", 0)
+
+
+def test_the_limits_in_the_docs_are_the_codes():
+    text = (Path(__file__).resolve().parents[1] / "docs" / "trace.md").read_text(encoding="utf-8")
+    for name, limit in LIMITS.items():
+        unit = limit.unit
+        assert f"| {name} | {limit.stretch:g} {unit} | {limit.episode:g} {unit} |" in text
+
+
+# ------------------------------------------------------------------ where
+
+
+def test_places_along_the_tile():
+    places = [place_of(x) for x in (0.5, 1.3, 1.5, 6.5, 6.6, 7.0)]
+    assert places == [
+        "start platform", "first transition", "zone", "zone", "second transition", "goal platform",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("family", ["gap", "stair"])
+def test_features_are_where_the_tile_has_them(family):
+    tile = tile_of(0, family, 8, 0)
+    heights = tile.heights[:, 80]
+    if family == "gap":  # a trench is as long as what is lowered
+        lowered = 0.05 * np.flatnonzero(heights < -0.3)
+        starts = lowered[np.diff(lowered, prepend=-1.0) > 0.1]
+        for k, x in enumerate(starts):
+            ((name, distance),) = features(tile, float(x) + 0.05, 4.0)
+            assert name == f"trench {k + 1} of 4" and distance == 0.0
+            ((_, distance),) = features(tile, float(x) - 0.3, 4.0)
+            assert distance == pytest.approx(0.3, abs=0.05)
+    else:  # a step is a cell in which the ground rises or sinks
+        steps = 0.05 * np.flatnonzero(np.abs(np.diff(heights)) > 0.01)
+        assert len(steps) == 16
+        for k, x in enumerate(steps):
+            ((name, distance),) = features(tile, float(x), 4.0)
+            assert name == f"step {k + 1} of 16" and distance <= 0.051
+
+
+def test_mixed_tiles_have_the_features_of_both_halves():
+    kinds = {"gap": "trench", "stair": "step", "pillar": "pillar"}
+    for episode in range(8):
+        tile = tile_of(0, "mixed", 6, episode)
+        found = [name.split()[0] for name, _ in features(tile, 4.0, 4.0)]
+        assert found == [kinds[part] for part in tile.parts if part in kinds]
+
+
+# ------------------------------------------------------------------ results
+
+
+def test_rows_are_written_as_they_are(tmp_path: Path):
+    path = tmp_path / "diagnosis.csv"
+    rows = [diagnose(walk()), diagnose(walk("gap", outcome="fell"))]
+    diagnosis.write(rows, path)
+    with open(path, newline="", encoding="utf-8") as file:
+        read = list(csv.DictReader(file))
+    assert read == [{k: str(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
+    diagnosis.write([], path)
+    header = ",".join(f.name for f in dataclasses.fields(Diagnosis))
+    assert path.read_text(encoding="utf-8").splitlines() == [header]
+    assert [p.name for p in tmp_path.iterdir()] == ["diagnosis.csv"]
+
+
+def test_summary_says_where_most_is_to_be_won():
+    def episode(family: str, outcome: str, policy: str = "tdgc") -> Episode:
+        row = (policy, "nominal", family, 6, 0, 0, outcome, 1.0, 1.0, 1.0, (1.0, 0.0, 0.0, 0.0))
+        return Episode(*row, np.zeros(2), np.zeros((1, 3)))
+
+    episodes = [episode("stair", "fell")] * 3 + [episode("rough", "left_tile")] * 2
+    episodes += [episode("stair", "left_tile")] + [episode("rough", "reached")] * 4
+    episodes += [episode("rough", "reached", "gp")]
+    rows = [diagnose(walk("stair", outcome="fell"))] * 3 + [diagnose(walk("rough"))] * 2
+    rows.append(diagnose(walk("stair")))
+    lines = describe(rows, episodes).splitlines()
+    assert lines[0] == "failures of tdgc, nominal: 6 of 10 episodes"
+    assert lines[2].split() == "stair 6 1 3 0 lost its footing on the way to the goal (3)".split()
+    assert lines[3].split() == "rough 6 2 0 0 steered off the tile (2)".split()
+    assert lines[4] == "most is to be won in stair, by execution: 30.0 points of success"
+    assert lines[5:] == ["failures of gp, nominal: 0 of 1 episodes"]

@@ -1,0 +1,66 @@
+"""Training tiles: when they are drawn, and that their numbers are enough to draw them again."""
+
+import dataclasses
+
+import numpy as np
+
+from tdgc.terrain import Tile, make_tile, tile_rng
+from tdgc.tiles import FLAT, TrainingTiles
+
+FAMILIES = ("stair", FLAT, "rough")
+ALL = np.arange(3)
+LEVELS = np.array([4, 5, 6])
+
+
+def raised(tile: Tile, level: int) -> Tile:
+    return dataclasses.replace(tile, heights=tile.heights + np.float32(0.01 * level))
+
+
+def heights(tiles: TrainingTiles, robot: int) -> np.ndarray:
+    return tiles.field.heights[161 * robot : 161 * (robot + 1)].copy()
+
+
+def test_each_robot_has_a_tile_of_its_own() -> None:
+    tiles = TrainingTiles(FAMILIES, seed=9, alter=raised)
+    tiles.draw(ALL, LEVELS)
+    for number, robot in enumerate((0, 2)):
+        family, level = FAMILIES[robot], int(LEVELS[robot])
+        tile = raised(make_tile(family, level / 10, tile_rng(9, family, level, number)), level)
+        np.testing.assert_array_equal(heights(tiles, robot), tile.heights[:, 40:121])
+    assert (heights(tiles, 1) == 0.0).all() and tiles.drawn == 2
+    plain = TrainingTiles(FAMILIES, seed=9)
+    plain.draw(ALL, LEVELS)
+    np.testing.assert_allclose(heights(tiles, 0) - heights(plain, 0), 0.04, atol=1e-6)
+
+
+def test_a_tile_serves_five_episodes_of_a_level() -> None:
+    tiles = TrainingTiles(FAMILIES, seed=0)
+    tiles.draw(ALL, LEVELS)
+    first = [heights(tiles, robot) for robot in ALL]
+    assert [tiles.begin(ALL, LEVELS).tolist() for _ in range(5)] == [[]] * 5
+    assert tiles.begin(np.array([1, 2]), LEVELS).tolist() == [2]  # what is flat stays
+    assert tiles.begin(np.array([2]), LEVELS).tolist() == []
+    higher = LEVELS + [1, 1, 0]
+    assert tiles.begin(ALL, higher).tolist() == [0]
+    assert tiles.level[[0, 2]].tolist() == [5, 6] and tiles.number[[0, 2]].tolist() == [3, 2]
+    changed = [(heights(tiles, robot) != first[robot]).any() for robot in ALL]
+    assert changed == [True, False, True] and tiles.drawn == 4
+    # Stairs of one level are all alike, so there is nothing to bring into Bullet.
+    seen = [tiles.begin(np.array([0]), higher).tolist() for _ in range(5)]
+    assert seen == [[]] * 5 and tiles.number[0] == 4 and tiles.episodes[0] == 1
+
+
+def test_numbers_are_enough_to_draw_the_tiles_again() -> None:
+    tiles = TrainingTiles(FAMILIES, seed=3)
+    tiles.draw(ALL, LEVELS)
+    for _ in range(7):
+        tiles.begin(np.array([0, 2]), LEVELS)
+    state = tiles.state_dict()
+    other = TrainingTiles(FAMILIES, seed=3)
+    other.draw(ALL, LEVELS + 1)
+    other.load_state_dict(state)
+    np.testing.assert_array_equal(other.field.heights, tiles.field.heights)
+    np.testing.assert_array_equal(other.field.support, tiles.field.support)
+    for a, b in ((tiles, other), (other, tiles)):
+        assert a.begin(np.array([2]), LEVELS).tolist() == []
+        assert (a.state_dict()["number"] == b.state_dict()["number"]).all()

@@ -1,0 +1,410 @@
+"""Traces: what they say is what happened; files come back as they were, or are refused."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from test_drivers import save_high
+from test_evaluation import SMALL
+
+import evaluate
+from tdgc import evaluation, trace
+from tdgc.commands import CONTINUOUS, INDEX, NAMES, CommandDecoder
+from tdgc.config import CommandRanges, HighRewardConfig
+from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
+from tdgc.evaluation import Cell, Episode, run_cell
+from tdgc.gaits import FEET, GAITS
+from tdgc.high_env import PRETRAINED, height_probes, load_low
+from tdgc.locomotion import Locomotion
+from tdgc.robot import Array
+from tdgc.terrain import TileField
+from tdgc.trace import COLUMNS, Selection, Trace, TraceError, Tracer
+
+ROOT = Path(__file__).resolve().parents[1]
+HOLD = 5  # control steps a decision
+
+
+class Notes(Tracer):
+    """A tracer that also notes each robot's states, control step by control step."""
+
+    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
+        super().begin(cell, loco, field, goal)
+        self.goal, self.seen = goal, [self._note(loco)]
+        self.probes = height_probes(loco)
+
+    def step(self, step: int, live: Any, outcome: Any) -> None:
+        super().step(step, live, outcome)
+        self.seen.append(self._note(self._loco))
+
+    @staticmethod
+    def _note(loco: Locomotion) -> dict[str, Array]:
+        s = loco.world.state
+        return {
+            "position": s.position.copy(),
+            "yaw": s.yaw.copy(),
+            "lin_vel": s.lin_vel.copy(),
+            "velocity": s.heading_vel.copy(),
+            "turn": s.ang_vel[:, 2].copy(),
+            "touch": s.foot_force > 1.0,
+            "wanted": loco.clock.contact > 0.5,
+            "power": np.abs(s.torque * s.qd).sum(axis=1),
+            "force": np.column_stack([s.trunk_force, s.leg_force]),
+            "command": loco.command.copy(),
+        }
+
+    def over(self, decision: int, name: str, k: int) -> Array:
+        """A value of robot ``k`` in the control steps after a decision."""
+        first = HOLD * decision + 1
+        return np.array([note[name][k] for note in self.seen[first : first + HOLD]])
+
+
+def watch(driver: Driver, cell: Cell, low: Any) -> tuple[Notes, list[Trace], list[Episode]]:
+    notes = Notes(driver, 5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "HORIZON", 1.04)  # 52 control steps: the last decision is cut off
+        episodes = run_cell(cell, low, driver, 5, notes)
+    return notes, notes.traces(), episodes
+
+
+@pytest.fixture(scope="module")
+def low():
+    return load_low(PRETRAINED / "low")
+
+
+@pytest.fixture(scope="module")
+def watched(low, tmp_path_factory: pytest.TempPathFactory):
+    """The notes, traces and episodes of a high level that is quick to change its mind."""
+    path = save_high(tmp_path_factory.mktemp("policy") / "high", low)
+    driver = HierarchyDriver(*load_high(path, *low))
+    return watch(driver, Cell("tdgc", "nominal", "rough", 8, 3, 2), low[0])
+
+
+# ------------------------------------------------------------------ what a trace says
+
+
+def test_a_row_a_decision_and_one_for_the_end(watched):
+    notes, traces, episodes = watched
+    for k, (t, e) in enumerate(zip(traces, episodes, strict=True)):
+        place = (t.policy, t.condition, t.family, t.level, t.episode, t.seed, t.outcome)
+        assert place == ("tdgc", "nominal", "rough", 8, 3 + k, 5, e.outcome)
+        assert list(t.columns) == [c.name for c in COLUMNS]
+        assert {len(values) for values in t.columns.values()} == {12}
+        assert t["time"] == pytest.approx([*np.arange(0.0, 1.01, 0.1), 1.04])
+        assert t["seconds"][1:] == pytest.approx([0.1] * 10 + [0.04])
+        assert [t["base_x"][-1], t["base_y"][-1], t["yaw"][-1]] == pytest.approx(e.track[-1])
+        for decision in range(11):
+            position = notes.seen[HOLD * decision]["position"][k]
+            away = np.linalg.norm(notes.goal[k] - position[:2])
+            assert t["goal_distance"][decision] == pytest.approx(away)
+            assert t["base_z"][decision] == pytest.approx(position[2])
+
+
+def test_decisions_are_those_of_the_policy_and_what_they_decode_to(watched):
+    notes, traces, _ = watched
+    decoder = CommandDecoder()
+    for k, t in enumerate(traces):
+        actions = np.stack([t[f"action_{name}"] for name in (*CONTINUOUS, "gait")], axis=1)
+        commands = np.stack([t[f"command_{name}"] for name in NAMES], axis=1)
+        assert commands[:-1] == pytest.approx(decoder.decode(actions[:-1]), abs=1e-6)
+        given = [notes.seen[HOLD * decision + 1]["command"][k] for decision in range(11)]
+        assert commands[:-1] == pytest.approx(np.array(given), abs=1e-6)
+        assert t["gait"][:-1].tolist() == [GAITS[g] for g in decoder.gait(actions[:-1])]
+        assert np.isnan(actions[-1]).all() and np.isnan(commands[-1]).all()
+        assert t["gait"][-1] is None
+    assert len({t["gait"][i] for t in traces for i in range(11)}) > 1
+
+
+def test_commands_at_their_bounds_are_marked(low):
+    class Extreme(BaselineDriver):
+        def command(self, step: int) -> Array:
+            super().command(step)[:, [INDEX["vx"], INDEX["vy"]]] = 1.0, -0.6
+            return self._command
+
+    _, (t,), _ = watch(Extreme(), Cell("gp", "nominal", "rough", 0, 0, 1), low[0])
+    marked = {name: set(t[f"at_bound_{name}"][:-1].tolist()) for name in CONTINUOUS}
+    ends = {"vx": {1.0}, "vy": {-1.0}, "power_weight": {-1.0}}  # the last is 0 by default
+    assert {name: marked.pop(name) for name in ends} == ends
+    del marked["yaw_rate"]  # whatever the goal asks
+    assert set().union(*marked.values()) == {0.0}
+
+
+def test_cues_are_what_the_high_level_was_told(watched):
+    notes, traces, _ = watched
+    for k, t in enumerate(traces):
+        assert set(t["family"]) == {"rough"}
+        assert [t[f"probe_{i:02d}"][0] for i in range(32)] == pytest.approx(notes.probes[k])
+
+
+def test_execution_is_measured_since_the_decision_before(watched):
+    notes, traces, _ = watched
+    for k, t in enumerate(traces):
+        assert np.isnan(t["error_vx"][0]) and np.isnan(t["power"][0])
+        for decision in range(11):
+            command = notes.over(decision, "command", k)
+            velocity, turn = notes.over(decision, "velocity", k), notes.over(decision, "turn", k)
+            row = {name: values[decision + 1] for name, values in t.columns.items()}
+            for j, name in enumerate(("vx", "vy")):
+                expected = np.mean(velocity[:, j] - command[:, j])
+                assert row[f"error_{name}"] == pytest.approx(expected, abs=1e-6)
+            expected = np.mean(turn - command[:, INDEX["yaw_rate"]])
+            assert row["error_yaw_rate"] == pytest.approx(expected, abs=1e-6)
+            touch, wanted = notes.over(decision, "touch", k), notes.over(decision, "wanted", k)
+            for f, foot in enumerate(FEET):
+                assert row[f"contact_{foot}"] == pytest.approx(touch[:, f].mean())
+                assert row[f"match_{foot}"] == pytest.approx((touch == wanted)[:, f].mean())
+            force = notes.over(decision, "force", k).max(axis=0)
+            assert row["trunk_force"] == pytest.approx(force[0])
+            assert row["leg_force"] == pytest.approx(force[1:].max())
+            assert row["power"] == pytest.approx(notes.over(decision, "power", k).mean(), rel=1e-5)
+
+
+def test_tilt_and_height_are_errors_of_their_commands(low):
+    """A baseline asks for a level trunk at its standing height, so the errors are the pose."""
+    cell = Cell("gp", "nominal", "tilt", 10, 0, 1)
+    _, (t,), _ = watch(BaselineDriver(), cell, low[0])
+    assert t["error_roll"][1:] == pytest.approx(t["roll"][1:], abs=0.1)
+    assert t["error_pitch"][1:] == pytest.approx(t["pitch"][1:], abs=0.1)
+    height = t["base_height"][1:] - low[1].robot.base_height
+    assert t["error_body_height"][1:] == pytest.approx(height, abs=0.03)
+
+
+def test_energy_of_an_episode_is_its_power_over_time(watched):
+    _, traces, episodes = watched
+    for t, e in zip(traces, episodes, strict=True):
+        assert e.energy_j == pytest.approx(np.sum(t["power"][1:] * t["seconds"][1:]), rel=1e-5)
+        assert e.energy_j > 10.0  # a second's walk of 12 kg
+
+
+def test_reward_terms_are_those_of_the_paper(watched):
+    """From the other columns by the formulas of Sec. IV-B."""
+    notes, traces, _ = watched
+    c, dt = HighRewardConfig(), 0.1
+    low = np.array(dataclasses.astuple(CommandRanges()))[:, 0]
+    high = np.array(dataclasses.astuple(CommandRanges()))[:, 1]
+    for k, t in enumerate(traces):
+        p = np.clip(1.0 - t["goal_distance"][1:] / 8.0, 0.0, 1.0)
+        expected = c.goal_distance * dt * (p + 1.0 - np.exp(-3.0 * p))
+        assert t["reward_goal_distance"][1:] == pytest.approx(expected, rel=1e-5)
+        expected = c.face * dt * np.cos(t["goal_bearing"][1:])
+        assert t["reward_face"][1:] == pytest.approx(expected, rel=1e-4)
+        assert t["reward_alive"][1:] == pytest.approx(c.alive * dt)
+        actions = np.stack([t[f"action_{name}"] for name in (*CONTINUOUS, "gait")], axis=1)
+        clipped = np.vstack([np.zeros(13), np.clip(actions[:-1], -1.0, 1.0)])
+        expected = c.action_rate * dt * np.sum(np.diff(clipped, axis=0) ** 2, axis=1)
+        assert t["reward_action_rate"][1:] == pytest.approx(expected, rel=1e-4)
+        commands = np.stack([t[f"command_{name}"] for name in NAMES], axis=1)[:-1]
+        shares = np.hstack([(commands[:, :12] - low) / (high - low), 2.0 * commands[:, 12:]])
+        expected = c.command_rate * dt * np.mean(np.diff(shares, axis=0) ** 2, axis=1)
+        assert t["reward_command_rate"][2:] == pytest.approx(expected, rel=1e-4)
+        for decision in range(11):
+            force = notes.over(decision, "force", k).max(axis=0)
+            expected = c.contact_force * dt * np.sum(np.maximum(force - 1.0, 0.0))
+            assert t["reward_contact_force"][decision + 1] == pytest.approx(expected, abs=1e-6)
+            now = notes.seen[min(HOLD * (decision + 1), 52)]
+            slow = np.linalg.norm(now["lin_vel"][k]) < 0.1
+            assert t["reward_laziness"][decision + 1] == pytest.approx(c.laziness * dt * slow)
+
+
+def test_the_baseline_has_no_actions_and_no_cues(low):
+    notes, traces, _ = watch(BaselineDriver(), Cell("gp", "nominal", "rough", 8, 3, 2), low[0])
+    empty = [f"action_{name}" for name in (*CONTINUOUS, "gait")]
+    empty += [f"probe_{i:02d}" for i in range(32)] + ["reward_action_rate"]
+    for k, t in enumerate(traces):
+        assert all(np.isnan(t[name]).all() for name in empty)
+        assert set(t["family"]) == {None}
+        assert set(t["gait"][:-1]) == {"trot"}
+        assert t["command_vx"][0] == pytest.approx(notes.seen[1]["command"][k, 0])
+        assert np.array_equal(t["at_bound_swing_height"][:-1], np.zeros(11))
+
+
+def test_robots_that_end_early_have_short_traces(low):
+    """Two robots without thigh motors fall while the third goes on; each has its own time."""
+
+    class Limp(BaselineDriver):
+        def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+            super().begin(loco, goal, family)
+            loco.world.strength = np.ones((3, 12))
+            loco.world.strength[0, [1, 4, 7, 10]] = loco.world.strength[1, [1, 4]] = 0.0
+
+    _, traces, episodes = watch(Limp(), Cell("gp", "nominal", "rough", 0, 0, 3), low[0])
+    assert [e.outcome for e in episodes].count("timeout") < 3
+    for t, e in zip(traces, episodes, strict=True):
+        steps = round(e.time_s / 0.02)
+        assert t.outcome == e.outcome
+        assert len(t["time"]) == -(-steps // HOLD) + 1
+        assert t["time"][-1] == pytest.approx(e.time_s)
+        assert np.isnan(t["command_vx"][-1]) and not np.isnan(t["command_vx"][-2])
+        assert t["seconds"][1:].sum() == pytest.approx(e.time_s)
+
+
+# ------------------------------------------------------------------ files
+
+
+def same(a: Trace, b: Trace) -> bool:
+    values = zip(a.columns.items(), b.columns.items(), strict=True)
+    alike = all(
+        m == n and (x.tolist() == y.tolist() if x.dtype == object else np.array_equal(x, y, True))
+        for (m, x), (n, y) in values
+    )
+    meta = [f.name for f in dataclasses.fields(Trace) if f.name != "columns"]
+    return alike and all(getattr(a, name) == getattr(b, name) for name in meta)
+
+
+def test_a_file_holds_the_trace_and_says_what_it_is(watched, tmp_path):
+    t = watched[1][0]
+    path = trace.write(t, tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["tdgc_nominal_rough_08_003.parquet"]
+    assert same(trace.read(path), t)
+    schema = pq.read_schema(path)
+    for c in COLUMNS:
+        about = {k.decode(): v.decode() for k, v in schema.field(c.name).metadata.items()}
+        assert (about["unit"], about["description"]) == (c.unit, c.meaning)
+        assert schema.field(c.name).type in (pa.float32(), pa.string())  # scalars only
+    meta = {k.decode(): v.decode() for k, v in schema.metadata.items()}
+    assert meta["format"] == "tdgc-trace" and meta["version"] == "1"
+    assert (meta["outcome"], meta["seed"], meta["episode"]) == (t.outcome, "5", "3")
+    assert pq.read_table(path)["command_vx"].null_count == 1  # the end has no decision
+
+
+def test_files_that_are_no_traces_are_refused(watched, tmp_path):
+    with pytest.raises(TraceError, match=r"none.parquet: no such file$"):
+        trace.read(tmp_path / "none.parquet")
+    text = tmp_path / "text.parquet"
+    text.write_text("time,vx\n0,1\n", encoding="utf-8")
+    with pytest.raises(TraceError, match=r"text.parquet: damaged, or not a Parquet file$"):
+        trace.read(text)
+    other = tmp_path / "other.parquet"
+    pq.write_table(pa.table({"time": [0.0]}), other)
+    with pytest.raises(TraceError, match=r"other.parquet: not a trace of this package$"):
+        trace.read(other)
+    path = trace.write(watched[1][0], tmp_path)
+    table = pq.read_table(path)
+    meta = table.schema.metadata
+    pq.write_table(table.replace_schema_metadata(meta | {b"version": b"2"}), other)
+    with pytest.raises(TraceError, match=r"a trace of version 2, this package reads 1$"):
+        trace.read(other)
+    moved = table.schema.field("probe_00").with_metadata({"unit": "m", "description": "elsewhere"})
+    place = table.schema.get_field_index("probe_00")
+    for wrong in (
+        table.drop_columns(["yaw"]),
+        table.slice(0, 1),
+        table.cast(table.schema.set(place, moved)),
+    ):
+        pq.write_table(wrong, other)
+        with pytest.raises(TraceError, match=r"columns are not those of a trace of version 1$"):
+            trace.read(other)
+    lacking = {k: v for k, v in meta.items() if k != b"seed"}
+    pq.write_table(table.replace_schema_metadata(lacking), other)
+    with pytest.raises(TraceError, match=r"does not say which episode it is of$"):
+        trace.read(other)
+
+
+def test_a_damaged_file_is_refused_in_one_line(watched, tmp_path):
+    t = watched[1][0]
+    path = trace.write(t, tmp_path)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for size in (0, 4, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:size])
+        with pytest.raises(TraceError, match=r"^[^\n]*damaged, or not a Parquet file$"):
+            trace.read(path)
+    refused = 0
+    for place in rng.integers(4, len(content) - 8, 60):
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        try:
+            found = trace.read(path)
+        except TraceError as error:
+            assert "\n" not in str(error)
+            refused += 1
+        else:  # in what is there twice, or says who wrote it; or in the words of the metadata
+            assert all(np.array_equal(found[c.name], t[c.name], c.unit != "") for c in COLUMNS)
+    assert refused > 20
+
+
+def test_no_half_file_is_left_behind(watched, tmp_path):
+    t = watched[1][0]
+    (tmp_path / t.file_name).mkdir()  # so that the file cannot take its place
+    with pytest.raises(OSError):
+        trace.write(t, tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == [t.file_name]
+
+
+def test_the_table_in_the_docs_is_the_codes():
+    text = (ROOT / "docs" / "trace.md").read_text(encoding="utf-8")
+    rows = [line for line in text.split("## Columns")[1].splitlines() if line.startswith("| `")]
+    assert rows == [f"| `{c.name}` | {c.unit or 'name'} | {c.meaning} |" for c in COLUMNS]
+
+
+# ------------------------------------------------------------------ the script
+
+
+def test_selection(watched):
+    t = watched[1][0]  # episode 3, a timeout
+    reached = dataclasses.replace(t, outcome="reached")
+    assert Selection.parse("all").includes(reached)
+    assert Selection.parse("failed").includes(t) and not Selection.parse("failed").includes(reached)
+    assert Selection.parse("4").includes(reached) and not Selection.parse("3").includes(t)
+    for text in ("", "0", "-1", "1.5", "some", "٣"):
+        with pytest.raises(TraceError, match="must be all, failed or a number from 1"):
+            Selection.parse(text)
+
+
+def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
+    flags = [*SMALL, "--policies", "gp", "--workers", "1", "--out", str(tmp_path)]
+    assert evaluate.main([*flags, "--trace", "failed"]) == 0
+    with open(tmp_path / "episodes.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    failed = [r for r in rows if r["outcome"] != "reached"]
+    assert failed
+    written = [trace.read(p) for p in sorted((tmp_path / "traces").iterdir())]
+    assert [(str(t.episode), t.outcome) for t in written] == [
+        (r["episode"], r["outcome"]) for r in failed
+    ]
+    with open(tmp_path / "diagnosis.csv", newline="", encoding="utf-8") as file:
+        diagnosed = list(csv.DictReader(file))
+    assert [(d["episode"], d["outcome"]) for d in diagnosed] == [
+        (r["episode"], r["outcome"]) for r in failed
+    ]
+    assert "most is to be won in gap, by execution: 100.0 points" in capsys.readouterr().out
+    # Fewer traces in the same folder: none of the old ones is left.
+    assert evaluate.main([*flags, "--trace", "1"]) == 0
+    assert [p.name for p in (tmp_path / "traces").iterdir()] == ["gp_nominal_gap_10_000.parquet"]
+    # Without traces the table is the same, and nothing claims to belong to it.
+    before = (tmp_path / "episodes.csv").read_bytes()
+    assert evaluate.main(flags) == 0
+    assert (tmp_path / "episodes.csv").read_bytes() == before
+    assert not (tmp_path / "diagnosis.csv").exists() and not list((tmp_path / "traces").iterdir())
+
+
+def test_without_pyarrow_the_script_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)  # as if it were not installed
+    assert evaluate.main(["--trace", "all", "--out", str(tmp_path / "out")]) == 2
+    message = "traces need pyarrow: install the extra 'trace', "
+    message += "pip install -c constraints.txt -e '.[trace]'"
+    assert capsys.readouterr().err == f"evaluate.py: {message}\n"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--trace", "0"], "--trace must be all, failed or a number from 1, not '0'"),
+        (
+            ["--tracking", "--trace", "all"],
+            "--tracking is of the low level alone: no --trace, --tune or --set",
+        ),
+    ],
+)
+def test_flags_that_cannot_be_used(flags, message, capsys):
+    assert evaluate.main(flags) == 2
+    assert capsys.readouterr().err == f"evaluate.py: {message}\n"
