@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Evaluate policies on TDGC-Bench: a table, episodes.csv, summary.json and figures.
+"""Evaluate policies on TDGC-Bench: a table, episodes.csv, summary.json, figures and a report.
 
 python evaluate.py --levels 6-10
 python evaluate.py --tracking
@@ -23,7 +23,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tdgc import diagnosis, film, gui, plots, tuning
+from tdgc import diagnosis, film, gui, plots, report, tuning
 from tdgc.config import LowLevelConfig
 from tdgc.diagnosis import Diagnosis, diagnose
 from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
@@ -248,8 +248,8 @@ def print_effect(effect: dict[str, Any]) -> None:
 def prepare(folder: Path, traced: bool, filmed: bool) -> None:
     """Make room for results: what an earlier run left and this one may not write goes away."""
     films = (old for kind in ("film", "sheet", "strip") for old in folder.glob(f"films/{kind}_*"))
-    tables = (folder / "diagnosis.csv", folder / "tuning.json")
-    for old in (*folder.glob("traces/*.parquet"), *films, *tables):
+    others = (folder / name for name in ("diagnosis.csv", "tuning.json", report.NAME))
+    for old in (*folder.glob("traces/*.parquet"), *films, *others):
         old.unlink(missing_ok=True)
     if filmed:
         (folder / "films").mkdir(exist_ok=True)
@@ -265,7 +265,7 @@ def run_table(
     traced: Selection | None = None,
     tuned: Tuning | None = None,
 ) -> int:
-    """Run all cells and write everything; the exit status, 1 where a film is missing."""
+    """Run all cells and write everything; the exit status, 1 where a film or report is missing."""
     folder = args.out / "traces"
     work = functools.partial(
         run_one,
@@ -300,9 +300,11 @@ def run_table(
         (args.out / "tuning.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
         print_effect(effect)
     print(f"\ntables and figures are in {args.out}")
-    if not recordings:
-        return 0
-    problems = film.produce(recordings, args.out / "films", args.workers)
+    problems = film.produce(recordings, args.out / "films", args.workers) if recordings else []
+    try:
+        print(f"all of it on one page: {report.write(args.out)}")
+    except OSError as error:
+        problems.append(f"no {report.NAME}: {error}")
     for problem in problems:
         print(f"evaluate.py: {problem}", file=sys.stderr)
     return 1 if problems else 0

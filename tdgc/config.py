@@ -10,16 +10,20 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import reprlib
 import types
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, TypeVar
+
+from tdgc.errors import InputError
 
 Range = typing.Annotated[tuple[float, float], "low <= high"]
 
 
-class ConfigError(ValueError):
+class ConfigError(InputError):
     """A configuration that cannot be used; the message is one line."""
 
 
@@ -322,6 +326,31 @@ def to_dict(config: Any) -> dict[str, Any]:
     return typing.cast(dict[str, Any], json.loads(json.dumps(dataclasses.asdict(config))))
 
 
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        ConfigError: a file that cannot be read or is no JSON, or a key that stands twice.
+    """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        table = dict(pairs)
+        if len(table) < len(pairs):
+            keys = [key for key, _ in pairs]
+            twice = next(key for key in keys if keys.count(key) > 1)
+            raise ConfigError(f"{path}: the key '{twice}' stands twice")
+        return table
+
+    try:
+        return json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=unique)
+    except ConfigError:
+        raise
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not a JSON file") from error
+
+
 def from_dict(cls: type[Config], data: Mapping[str, Any], where: str = "") -> Config:
     """Build ``cls`` from a plain dict; missing keys keep their defaults.
 
@@ -329,7 +358,8 @@ def from_dict(cls: type[Config], data: Mapping[str, Any], where: str = "") -> Co
         ConfigError: a key that ``cls`` does not have, or a value of the wrong type.
     """
     if not isinstance(data, Mapping):
-        raise ConfigError(f"{where or cls.__name__} must be a table of keys, not {data!r}")
+        shown = reprlib.repr(data)
+        raise ConfigError(f"{where or cls.__name__} must be a table of keys, not {shown}")
     hints = typing.get_type_hints(cls, include_extras=True)
     names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
     values = {}
@@ -376,15 +406,16 @@ def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
 def _coerce(hint: Any, value: Any, path: str) -> Any:
     """``value`` as the annotated type: the few that configurations use, and nothing else."""
     origin = typing.get_origin(hint)
+    shown = reprlib.repr(value)  # short, whatever the file holds
     if hint == Range:
         low, high = _coerce(typing.get_args(hint)[0], value, path)
         if low > high:
-            raise ConfigError(f"'{path}' must be [low, high] with low <= high, not {value!r}")
+            raise ConfigError(f"'{path}' must be [low, high] with low <= high, not {shown}")
         return low, high
     if origin is Literal:
         if value not in typing.get_args(hint):
             allowed = ", ".join(typing.get_args(hint))
-            raise ConfigError(f"'{path}' must be one of {allowed}, not {value!r}")
+            raise ConfigError(f"'{path}' must be one of {allowed}, not {shown}")
         return value
     if dataclasses.is_dataclass(hint):
         return from_dict(typing.cast(type, hint), value, path)
@@ -396,7 +427,7 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
     if origin is tuple:
         args = typing.get_args(hint)
         if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"'{path}' must be a list, not {value!r}")
+            raise ConfigError(f"'{path}' must be a list, not {shown}")
         if args[-1] is Ellipsis:
             return tuple(_coerce(args[0], v, path) for v in value)
         if len(value) != len(args):
@@ -407,10 +438,14 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
     if hint is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if not math.isfinite(value):
-            raise ConfigError(f"'{path}' must be a finite number, not {value!r}")
-        return float(value)
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number beyond the largest float
+            number = math.inf
+        if not math.isfinite(number):
+            raise ConfigError(f"'{path}' must be a finite number, not {shown}")
+        return number
     if hint is str and isinstance(value, str):
         return value
     kind = getattr(hint, "__name__", str(hint))
-    raise ConfigError(f"'{path}' must be of type {kind}, not {value!r}")
+    raise ConfigError(f"'{path}' must be of type {kind}, not {shown}")

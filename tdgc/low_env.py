@@ -85,7 +85,11 @@ _CROSSING_GAITS = (0.8, 0.05, 0.075, 0.075)
 _TRENCH_GAITS = (0.3, 0.5, 0.1, 0.1)
 _LEAP_SPEED = (0.85, 1.0)  # m/s
 _LEAP_SWING = 0.09  # m at most: four legs drawn up at once drop the trunk
-_STRIDE = (0.36, 0.42)  # m, three of 0.417 m make a trench's distance to the next
+_STRIDE = (0.33, 0.42)  # m, three of 0.417 m make a trench's distance to the next
+# Where pronk lands, measured in low-9 at about 1 m/s and 2.5 Hz: front feet so far ahead of the
+# trunk as it is at clock 0, and rear feet so much further behind them than commanded, since they
+# touch down sooner.
+_LANDING = (0.20, 0.055)  # m
 _TIMING_GAIN = 1.5  # share of the frequency for each cycle that the feet are out of time
 # Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet land
 # on the same lines, so that a trench fits between two of them. Drawn evenly, such commands are too
@@ -103,7 +107,7 @@ _GROW_CONTACT = 0.7
 
 
 def straddling_frequency(
-    x: Array, speed: Array, clock: Array, stride: Array, length: Array, duty: Array
+    x: Array, speed: Array, clock: Array, stride: Array, length: Array
 ) -> Array:
     """Step frequency in Hz at which pronk lands at either side of the trenches, all (M,).
 
@@ -112,13 +116,13 @@ def straddling_frequency(
         speed: m/s, forward.
         clock: the gait's, 0 where the feet touch down.
         stride, length: m, from one landing to the next, and between front and rear feet.
-        duty: share of a cycle in stance.
 
-    Feed-forward keeps the stride; to it comes what brings the next landing of the front feet half a
-    stride before the centre of the nearest trench.
+    Feed-forward keeps the stride; to it comes what brings the lines on which front and rear feet
+    land half a stride before the centre of the nearest trench.
     """
     centres = ZONE[0] + TRENCH_SPACING * (np.arange(4) + 0.5)
-    landing = x + 0.5 * length + 0.5 * duty * stride  # feet touch down ahead of where they rest
+    front, rear = _LANDING[0], _LANDING[0] - length - _LANDING[1] + stride  # the rear's next line
+    landing = x + 0.5 * (front + rear)
     trench = centres[np.abs(landing[:, None] - centres).argmin(axis=1)]
     late = np.mod((landing - trench) / stride - clock, 1.0) - 0.5  # 0.5 turns -0.5 strides to 0
     return np.asarray(speed / stride * (1.0 + _TIMING_GAIN * late))
@@ -391,8 +395,11 @@ class LowLevelTask:
         leaps = crossing & trenches & (gait == GAITS.index("pronk"))
         swing = INDEX["swing_height"]
         values[leaps, swing] = rng.uniform(self._low[swing], _LEAP_SWING, int(leaps.sum()))
+        stride, length = rng.uniform(*_STRIDE, n), INDEX["stance_length"]
+        closest = np.clip(stride - _LANDING[1], self._low[length], self._high[length])
+        values[leaps, length] = closest[leaps]
         command[index] = np.concatenate([values, gait_embedding(gait)], axis=1)
-        self._stride[index] = np.where(leaps, rng.uniform(*_STRIDE, n), 0.0)
+        self._stride[index] = np.where(leaps, stride, 0.0)
         slow, fast = rng.uniform(*_CROSSING_SPEED, n), rng.uniform(*_LEAP_SPEED, n)
         self._speed[index] = np.where(leaps, fast, slow)
         free = rng.uniform(-np.pi, np.pi, n)
@@ -448,7 +455,6 @@ class LowLevelTask:
                 self.locomotion.clock.clock[leaping],
                 self._stride[leaping],
                 command[:, INDEX["stance_length"]],
-                command[:, INDEX["duration"]],
             )
             j = INDEX["frequency"]
             self.locomotion.command[leaping, j] = np.clip(frequency, self._low[j], self._high[j])

@@ -29,6 +29,7 @@ import hashlib
 import json
 import math
 import os
+import reprlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,6 +53,8 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from tdgc.errors import InputError
+
 FORMAT = "tdgc-policy"
 VERSION = 1
 KINDS = ("mlp", "lstm")
@@ -74,7 +77,7 @@ _MAX_FLOAT32 = float(np.finfo(np.float32).max)
 _MAX_TENSOR_HEADER = 65536  # bytes of a safetensors file that are not weights
 
 
-class PolicyFileError(ValueError):
+class PolicyFileError(InputError):
     """A policy file that cannot be used; the message is one line and names the file."""
 
 
@@ -341,25 +344,25 @@ class Header:
             raise PolicyFileError(f"not a {FORMAT} file")
         version = table.get("version")
         if not isinstance(version, int) or isinstance(version, bool) or version != VERSION:
-            raise PolicyFileError(f"format version {version!r:.40}; this code reads {VERSION}")
+            raise PolicyFileError(f"format version {_shown(version)}; this code reads {VERSION}")
         keys = ("format", "version", "kind", "architecture", "observation", "action", "mirror",
                 "sha256", "meta")  # fmt: skip
         _check_keys(table, keys, "the file")
         kind, sha256, meta = table["kind"], table["sha256"], table["meta"]
         if kind not in KINDS:
-            raise PolicyFileError(f"kind {kind!r:.40}; known: {', '.join(KINDS)}")
+            raise PolicyFileError(f"kind {_shown(kind)}; known: {', '.join(KINDS)}")
         if not isinstance(sha256, str):
-            raise PolicyFileError(f"'sha256' must be a string, not {sha256!r:.40}")
+            raise PolicyFileError(f"'sha256' must be a string, not {_shown(sha256)}")
         if not isinstance(meta, dict):
-            raise PolicyFileError(f"'meta' must be a table, not {meta!r:.40}")
+            raise PolicyFileError(f"'meta' must be a table, not {_shown(meta)}")
 
         arch = table["architecture"]
         _check_keys(arch, ("activation", "actor", "critic", "lstm"), "'architecture'")
         if not isinstance(arch["activation"], str) or arch["activation"] not in ACTIVATIONS:
             known = ", ".join(ACTIVATIONS)
-            raise PolicyFileError(f"activation {arch['activation']!r:.40}; known: {known}")
+            raise PolicyFileError(f"activation {_shown(arch['activation'])}; known: {known}")
         if (arch["lstm"] is not None) != (kind == "lstm"):
-            raise PolicyFileError(f"'lstm' is {arch['lstm']!r:.40} in a file of kind '{kind}'")
+            raise PolicyFileError(f"'lstm' is {_shown(arch['lstm'])} in a file of kind '{kind}'")
 
         observation = table["observation"]
         _check_keys(observation, ("size", "actor_size"), "'observation'")
@@ -399,10 +402,10 @@ def _no_constant(name: str) -> float:
 
 def _check_keys(table: Any, keys: tuple[str, ...], where: str) -> None:
     if not isinstance(table, dict):
-        raise PolicyFileError(f"{where} must be a table of keys, not {table!r:.40}")
+        raise PolicyFileError(f"{where} must be a table of keys, not {_shown(table)}")
     for key in table:
         if key not in keys:
-            raise PolicyFileError(f"unknown key {key!r:.40} in {where}")
+            raise PolicyFileError(f"unknown key {_shown(key)} in {where}")
     for key in keys:
         if key not in table:
             raise PolicyFileError(f"key '{key}' is missing from {where}")
@@ -410,7 +413,9 @@ def _check_keys(table: Any, keys: tuple[str, ...], where: str) -> None:
 
 def _size(value: Any, name: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MAX_SIZE:
-        raise PolicyFileError(f"{name} must be a whole number in 1..{_MAX_SIZE}, not {value!r:.40}")
+        raise PolicyFileError(
+            f"{name} must be a whole number in 1..{_MAX_SIZE}, not {_shown(value)}"
+        )
     return value
 
 
@@ -449,10 +454,10 @@ def _bounds(value: Any, count: int, unbounded: float, name: str) -> tuple[float,
             bounds.append(unbounded)
         elif isinstance(number, (int, float)) and not isinstance(number, bool):
             if not abs(number) <= _MAX_FLOAT32:  # a JSON 1e999 reads as inf
-                raise PolicyFileError(f"{name} of 'action' holds {number!r:.40}, out of range")
+                raise PolicyFileError(f"{name} of 'action' holds {_shown(number)}, out of range")
             bounds.append(float(number))
         else:
-            raise PolicyFileError(f"{name} of 'action' holds {number!r:.40}, not a number")
+            raise PolicyFileError(f"{name} of 'action' holds {_shown(number)}, not a number")
     return tuple(bounds)
 
 
@@ -609,6 +614,10 @@ def _read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
             raise PolicyFileError(f"{weights_path}: tensor '{name}' holds a number not finite")
         tensors[name] = th.from_numpy(array)
     return header, tensors
+
+
+def _shown(value: Any) -> str:
+    return reprlib.repr(value)[:40]  # repr fails on what is nested about as deep as can be read
 
 
 def _one_line(error: Exception) -> str:

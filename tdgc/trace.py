@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from tdgc import rewards
 from tdgc.commands import CONTINUOUS, INDEX, NAMES, NUM_ACTIONS, UNITS, CommandDecoder, gait_index
 from tdgc.drivers import Driver
+from tdgc.errors import InputError
 from tdgc.evaluation import OUTCOMES, Cell, joint_power
 from tdgc.gaits import FEET, GAITS
 from tdgc.high_env import PROBES, SEMANTIC, command_share, height_probes, high_step
@@ -36,7 +37,7 @@ FORMAT = "tdgc-trace"
 VERSION = 1
 
 
-class TraceError(ValueError):
+class TraceError(InputError):
     """A trace that cannot be written or read; the message is one line."""
 
 
@@ -407,6 +408,8 @@ def read(path: str | Path) -> Trace:
             fields = [(f.name, f.type, _about(f)) for f in file.schema_arrow]
             known = (meta.get("format"), meta.get("version"), fields)
             table = file.read() if known == (FORMAT, str(VERSION), _fields()) else None
+            if table is not None:
+                table.validate(full=True)  # that its names are UTF-8, among others
     except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
         raise TraceError(f"{path}: damaged, or not a Parquet file") from error
     if meta.get("format") != FORMAT:
@@ -422,4 +425,7 @@ def read(path: str | Path) -> Trace:
     except (KeyError, ValueError) as error:
         raise TraceError(f"{path}: does not say which episode it is of") from error
     columns = {c.name: table[c.name].to_numpy(zero_copy_only=False) for c in COLUMNS}
-    return Trace(**head, columns=columns)  # type: ignore[arg-type]
+    trace = Trace(**head, columns=columns)  # type: ignore[arg-type]
+    if "\0" in trace.file_name or Path(trace.file_name).name != trace.file_name:
+        raise TraceError(f"{path}: of an episode '{trace.file_name}', which cannot name a file")
+    return trace

@@ -26,6 +26,7 @@ from types import FrameType
 from typing import Any, Protocol, cast
 
 import numpy as np
+import safetensors
 import safetensors.torch
 import torch as th
 from numpy.typing import NDArray
@@ -37,7 +38,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tqdm import tqdm
 
 from tdgc import __version__, policies
-from tdgc.config import Config, ConfigError, from_dict, to_dict, with_overrides
+from tdgc.config import Config, ConfigError, from_dict, read_json, to_dict, with_overrides
+from tdgc.errors import InputError
 from tdgc.state import State, join, split
 from tdgc.vec import TaskVecEnv, WorkerError
 
@@ -48,7 +50,7 @@ _READABLE = (1, 2)  # version 1 has no episodes under way: its runs go on with n
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
 
-class CheckpointError(ValueError):
+class CheckpointError(InputError):
     """A checkpoint or run folder that cannot be used; the message is one line."""
 
 
@@ -140,15 +142,19 @@ def read_checkpoint(path: Path) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
     try:
         data = (path / "state.safetensors").read_bytes()
         header = json.loads((path / "state.json").read_bytes())
-        if header.get("format") != "tdgc-checkpoint" or header.get("version") not in _READABLE:
+        known = isinstance(header, dict) and header.get("format") == "tdgc-checkpoint"
+        if not known or header.get("version") not in _READABLE:
             versions = " or ".join(map(str, _READABLE))
             raise CheckpointError(f"{path}: not a tdgc checkpoint of version {versions}")
+        for counter in ("num_timesteps", "n_updates"):
+            if type(header.get(counter)) is not int or not 0 <= header[counter] < 2**63:
+                raise CheckpointError(f"{path}: '{counter}' is no count")
         if hashlib.sha256(data).hexdigest() != header["sha256"]:
             raise CheckpointError(f"{path}: its checksum does not match, it is damaged")
         return safetensors.torch.load(data), header
-    except (OSError, ValueError, AttributeError, KeyError) as error:
-        if isinstance(error, CheckpointError):
-            raise
+    except CheckpointError:
+        raise
+    except (OSError, ValueError, KeyError, RuntimeError, safetensors.SafetensorError) as error:
         raise CheckpointError(f"{path}: cannot be read: {error}") from error
 
 
@@ -490,8 +496,9 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     if args.resume:
         if not stored.is_file():
             raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
-        data = json.loads(stored.read_text(encoding="utf-8"))
-        data.pop("checkpoint_steps", None)  # of runs whose checkpoints were so many steps apart
+        data = read_json(stored)
+        if isinstance(data, dict):  # of runs whose checkpoints were so many steps apart
+            data.pop("checkpoint_steps", None)
         config = from_dict(type(config), data)
     elif stored.exists():
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")

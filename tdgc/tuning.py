@@ -14,7 +14,6 @@ beyond the bound changes. In JSON, all keys optional:
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +29,7 @@ from tdgc.config import (
     HighLevelConfig,
     LowLevelConfig,
     from_dict,
+    read_json,
     to_dict,
     with_overrides,
 )
@@ -99,33 +99,8 @@ def load(path: str | Path | None, assignments: Iterable[str] = ()) -> Tuning:
         ConfigError: a file that cannot be read or is no JSON, an unknown key or one that stands
             twice, a value of the wrong type, NaN or infinite; the message is one line.
     """
-    try:
-        data = {} if path is None else _read(Path(path))
-        return with_overrides(from_dict(Tuning, data), assignments)
-    except (ConfigError, OverflowError) as error:
-        text = str(error) if isinstance(error, ConfigError) else "a number in a tuning is too large"
-        # Keys and values are quoted in messages, and they may hold anything.
-        raise ConfigError(
-            "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-        ) from error
-
-
-def _read(path: Path) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise ConfigError(f"{path}: the key '{key}' stands twice")
-        return dict(pairs)
-
-    try:
-        return json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=unique)
-    except ConfigError:
-        raise
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not a JSON file") from error
+    data = {} if path is None else read_json(Path(path))
+    return with_overrides(from_dict(Tuning, data), assignments)
 
 
 def tuned_ranges(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> CommandRanges:

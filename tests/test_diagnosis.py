@@ -80,7 +80,7 @@ class Blindfold(HierarchyDriver):
             return super().command(step)
 
 
-@pytest.mark.parametrize("joint", [2, 10])  # a front calf, a rear thigh
+@pytest.mark.parametrize("joint", [2, 11])  # a front calf, a rear calf
 def test_a_broken_motor_is_the_executions_fault(joint, low, pair):
     driver = WeakMotor(*pair)
     driver.joint = joint

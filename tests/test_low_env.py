@@ -632,14 +632,13 @@ def test_penalties_count_half_on_relief() -> None:
 
 
 def test_timing_puts_landings_at_either_side_of_a_trench() -> None:
-    """The centre of the first trench is at 2.125 m; feet land 0.5 * 0.4 + 0.25 * 0.4 ahead."""
+    """The centre of the first trench is at 2.125 m; feet land 0.20 m ahead, all on one line."""
 
-    def frequency(x: float, clock: float) -> float:
+    def frequency(x: float, clock: float, length: float = 0.345) -> float:
         one = np.ones(1)
-        args = (x * one, 1.0 * one, clock * one, 0.4 * one, 0.4 * one, 0.5 * one)
-        return float(straddling_frequency(*args)[0])
+        return float(straddling_frequency(x * one, one, clock * one, 0.4 * one, length * one)[0])
 
-    on_time = 2.125 - 0.2 - 0.3  # the trunk when the front feet land half a stride before it
+    on_time = 2.125 - 0.2 - 0.2  # the trunk when the feet land half a stride before the centre
     assert frequency(on_time, 0.0) == pytest.approx(2.5)
     assert frequency(on_time + 0.1, 0.25) == pytest.approx(2.5)  # a quarter of a cycle later
     assert frequency(on_time + 0.4, 0.0) == pytest.approx(2.5)  # the landing behind it
@@ -647,6 +646,8 @@ def test_timing_puts_landings_at_either_side_of_a_trench() -> None:
     # Too far for its clock by a tenth of a stride: step sooner.
     assert frequency(on_time + 0.04, 0.0) == pytest.approx(2.5 * 1.15)
     assert frequency(on_time - 0.04, 0.0) == pytest.approx(2.5 * 0.85)
+    # Rear feet 2 cm closer to the front ones: the middle of the two lines is 1 cm ahead.
+    assert frequency(on_time - 0.01, 0.0, 0.325) == pytest.approx(2.5)
 
 
 def test_half_of_the_crossings_of_trenches_leap() -> None:
@@ -657,6 +658,8 @@ def test_half_of_the_crossings_of_trenches_leap() -> None:
     assert (leaps == (pronks & gap)).all()
     assert 0.4 < leaps[gap & task._crossing].mean() < 0.6
     assert (task._facing[leaps] == 0.0).all()
+    stride, length = task._stride[leaps], task.locomotion.command[leaps, INDEX["stance_length"]]
+    np.testing.assert_allclose(length, np.maximum(stride - 0.055, 0.33))
     speed = np.hypot(*task.locomotion.command[leaps, :2].T)
     assert speed.min() > 0.5 and speed.max() <= 1.0 + 1e-9
     task.close()
@@ -785,6 +788,8 @@ def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
     task.restart()
     task.level[:] = [3, 1, 0]
     live(task, 40)
+    while task.locomotion.world.state.foot_force.max() < 1.0:
+        live(task, 1)
     task.command_share[1] = 0.65
     assert (task.elapsed > task._began).any()
     task._next_push[0] = 0

@@ -58,6 +58,7 @@ COMMANDS: dict[str, str | None] = {
 #: What is in ``{tmp}`` afterwards.
 OUTPUTS = (
     "first/summary.json",
+    "first/report.html",
     "low/config.json",
     "low/policy.json",
     "low/policy.safetensors",

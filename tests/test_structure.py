@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 #: rank here; a rank may wait for its module.
 RANKS = {
     "tdgc": 0,
+    "errors": 0,
     "config": 1,
     "state": 1,
     "terrain": 1,
@@ -46,6 +47,7 @@ RANKS = {
     "plots": 12,
     "diagnosis": 13,
     "film": 13,
+    "report": 14,
     "gui": 14,
     "train_low": 15,
     "train_high": 15,

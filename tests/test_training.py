@@ -498,7 +498,7 @@ def test_flags_and_folders_that_cannot_be_used(
         f"{used}: no checkpoint that can be read": ["--resume", "--out", str(used)],
         "unknown configuration key 'env.robot.kq'": ["--set", "env.robot.kq=1"],
         "cannot read --set 'seed'": ["--set", "seed"],
-        "Expecting value": ["--resume", "--out", str(damaged)],
+        "not a JSON file": ["--resume", "--out", str(damaged)],
     }
     for message, arguments in cases.items():
         where = [] if "--out" in arguments else ["--out", str(empty)]

@@ -1,0 +1,14 @@
+"""What all errors about something that was read have in common: their message is one line."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Something that was read and cannot be used.
+
+    Messages quote keys, values and file names, which may hold anything: what cannot be printed is
+    escaped, so that a message is always one line.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
