@@ -215,7 +215,7 @@ def test_raibert_error_is_measured_in_the_heading_frame() -> None:
 
 def test_swing_height() -> None:
     """Robot 1: FL at mid-swing 0.01 m too low, FR half way up as it should be, rear in stance."""
-    phases = np.array([[0.25] * 4, [0.75, 0.625, 0.25, 0.25]])
+    phases = np.array([[0.25] * 4, [0.75, 7.0 / 12.0, 0.25, 0.25]])  # half a sine: 1 and 1/2
     heights = np.full((2, 4), FOOT_RADIUS)
     heights[1, 0] += 0.07
     heights[1, 1] += 0.04
