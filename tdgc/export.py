@@ -50,7 +50,9 @@ from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelCon
 from tdgc.drivers import load_high
 from tdgc.gaits import FEET, GAIT_TABLE, GAITS
 from tdgc.high_env import (
+    GOAL_SCALE,
     PRETRAINED,
+    PROBE_RANGE,
     PROBES,
     SEMANTIC,
     NavigationTask,
@@ -59,7 +61,7 @@ from tdgc.high_env import (
     load_low,
     observe_high,
 )
-from tdgc.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, SPEED_SCALE
+from tdgc.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE
 from tdgc.low_env import is_fallen
 from tdgc.policies import Policy
 from tdgc.robot import (
@@ -84,10 +86,6 @@ FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
 TOLERANCE = 1e-5
 
 _ONNX_PACKAGES = ("onnx", "onnxruntime", "onnxscript")  # the extra `export` of setup.cfg
-# As ``Locomotion.observe`` and ``observe_high`` scale them.
-_GYRO_SCALE = 0.25
-_GOAL_SCALE = 0.125  # 1/m
-_PROBE_RANGE = 0.5  # m
 
 
 # ---------------------------------------------------------------------------------------------
@@ -257,7 +255,7 @@ class LowLevel(nn.Module):
             self._gait(command),
         ]
         if "gyro" in x:
-            parts.append(_GYRO_SCALE * x["gyro"])
+            parts.append(GYRO_SCALE * x["gyro"])
         action = self.actor(th.cat(parts).float()).double().clamp(-self.limit, self.limit)
         clock = clock + self.dt * command[INDEX["frequency"]]
         return action, pose + self.joint_scale * action, clock - clock.floor()
@@ -295,7 +293,7 @@ class HighLevel(nn.Module):
         family = "1 for the terrain under the robot, 0 for the others"
         probes = (
             "ground at points of the frame that turns by yaw alone, above a plane "
-            f"{low.robot.base_height:g} m under the trunk; clipped at {_PROBE_RANGE:g} m"
+            f"{low.robot.base_height:g} m under the trunk; clipped at {PROBE_RANGE:g} m"
         )
         cues = {
             "family": Signal("family", len(SEMANTIC), "1", family, "families"),
@@ -325,7 +323,7 @@ class HighLevel(nn.Module):
         goal = x["goal"]
         distance = (goal * goal).sum(0, keepdim=True).sqrt()
         parts = [
-            _GOAL_SCALE * distance,
+            GOAL_SCALE * distance,
             th.where(distance > 0.0, goal / distance, self.ahead),
             x["time_left"] / self.seconds,
             x["gravity"],
@@ -337,7 +335,7 @@ class HighLevel(nn.Module):
         if "family" in x:
             parts.append(x["family"])
         if "probes" in x:
-            parts.append(x["probes"].clamp(-_PROBE_RANGE, _PROBE_RANGE) / _PROBE_RANGE)
+            parts.append(x["probes"].clamp(-PROBE_RANGE, PROBE_RANGE) / PROBE_RANGE)
         state = (x["hidden"].float()[None], x["cell"].float()[None])
         hidden, cell = th.lstm_cell(th.cat(parts).float()[None], state, *self.lstm)
         decision = self.actor(hidden[0]).double()

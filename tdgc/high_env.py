@@ -37,8 +37,8 @@ from tdgc.world import World
 #: Where the shipped policies are.
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 
-_GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
-_PROBE_RANGE = 0.5  # m, deeper and higher looks the same
+GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
+PROBE_RANGE = 0.5  # m, deeper and higher looks the same
 
 #: The sparse geometric cue: 32 heights in the heading frame, from a hind foot to three strides
 #: ahead, staggered over four lines: an edge across the way is found to 5 cm, and a pillar on it,
@@ -73,7 +73,7 @@ def height_probes(loco: Locomotion) -> Array:
     x = state.position[:, :1] + c * PROBES[:, 0] - s * PROBES[:, 1]
     y = state.position[:, 1:2] + s * PROBES[:, 0] + c * PROBES[:, 1]
     standing = state.position[:, 2:3] - loco.robot.base_height
-    return np.clip(loco.world.ground_height(x, y) - standing, -_PROBE_RANGE, _PROBE_RANGE)
+    return np.clip(loco.world.ground_height(x, y) - standing, -PROBE_RANGE, PROBE_RANGE)
 
 
 def observe_high(
@@ -99,7 +99,7 @@ def observe_high(
     bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
     distance = np.linalg.norm(offset, axis=1)
     parts = [
-        np.stack([_GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1),
+        np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1),
         1.0 - time_share[:, None],
         state.gravity,
         state.q - loco.joint_offset - loco.nominal,
@@ -110,7 +110,7 @@ def observe_high(
     if cues in ("both", "semantic"):
         parts.append(np.eye(len(SEMANTIC))[families])
     if cues in ("both", "geometric"):
-        parts.append(height_probes(loco) / _PROBE_RANGE)
+        parts.append(height_probes(loco) / PROBE_RANGE)
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 

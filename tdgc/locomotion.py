@@ -30,6 +30,7 @@ from tdgc.terrain import TileField
 from tdgc.world import World
 
 SPEED_SCALE = 0.05  # joint speed as the networks see it (Walk These Ways)
+GYRO_SCALE = 0.25  # angular velocity likewise
 _HISTORY = 3  # control steps of targets kept: the step, and two before for latency up to 40 ms
 
 #: Names and sizes of the actor's observation in order: s^L of Sec. IV-A.
@@ -265,6 +266,5 @@ class Locomotion:
             gait_index(self.command)[:, None] / (len(GAITS) - 1),
         ]
         if self.gyro:
-            # 0.25: angular velocity as Walk These Ways scales it.
-            parts.append(0.25 * np.einsum("mji,mj->mi", state.rotation, state.ang_vel))
+            parts.append(GYRO_SCALE * np.einsum("mji,mj->mi", state.rotation, state.ang_vel))
         return np.concatenate(parts, axis=1).astype(np.float32)
