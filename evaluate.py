@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,8 +24,9 @@ from tqdm import tqdm
 
 from tdgc import diagnosis, film, gui, plots, report, tuning
 from tdgc.config import LowLevelConfig
+from tdgc.cores import usable_cores, workers_flag
 from tdgc.diagnosis import Diagnosis, diagnose
-from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
+from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
 from tdgc.evaluation import (
     CONDITIONS,
     Cell,
@@ -40,12 +40,14 @@ from tdgc.evaluation import (
 from tdgc.high_env import PRETRAINED, load_low
 from tdgc.policies import Policy
 from tdgc.recording import Recorder, Recording, Together
+from tdgc.teacher import STYLES
 from tdgc.terrain import ALL_FAMILIES, FAMILIES, OOD_LEVELS
 from tdgc.trace import Selection, Tracer, check_installed, write
 from tdgc.tuning import TunedDriver, Tuning
 from tdgc.world import WindowError
 
 POLICIES = ("tdgc", "gp")
+TEACHER = "teacher"
 TUNED = "tdgc-tuned"  # beside "tdgc" where there is a tuning
 SHIPPED_HIGH = PRETRAINED / "high"
 
@@ -57,8 +59,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=100, help="a cell (100)")
     parser.add_argument(
         "--policies",
-        help="all, or of tdgc (the hierarchy), gp (the scripted baseline); all where there is a "
-        "high level, shipped or given by --high, and otherwise gp",
+        help="all, or of tdgc (the hierarchy), gp (the scripted baseline) and teacher (the script "
+        "that tdgc imitated first, which is told where everything is; not among all); all where "
+        "there is a high level, shipped or given by --high, and otherwise gp",
     )
     parser.add_argument(
         "--conditions", default="nominal", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
@@ -99,7 +102,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "drive the low level with sliders (drive), or watch the first policy decide (watch)",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument(
+        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/evaluation"), help="results folder")
     return parser.parse_args(arguments)
 
@@ -168,6 +173,8 @@ def make_drivers(
     for name in names:
         if name == "gp":
             drivers[name] = BaselineDriver()
+        elif name == TEACHER:
+            drivers[name] = TeacherDriver()
         elif high is None:
             raise ValueError("no high level is shipped; give one with --high, or use --policies gp")
         else:
@@ -334,8 +341,12 @@ def main(arguments: list[str] | None = None) -> int:
         levels = choose_levels(args.levels)
         families = choose(args.families, ALL_FAMILIES, FAMILIES, "family")
         default = "gp" if high is None else "all"
-        names = choose(args.policies or default, POLICIES, POLICIES, "policy")
+        names = choose(args.policies or default, (*POLICIES, TEACHER), POLICIES, "policy")
         conditions = choose(args.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition")
+        if TEACHER in names and "mixed" in (*families, *conditions):
+            raise ValueError(f"the {TEACHER} knows {', '.join(STYLES)}; it cannot lead on mixed")
+        if args.workers == "auto":
+            args.workers = usable_cores()
         for flag, value in (("--episodes", args.episodes), ("--workers", args.workers)):
             if value < 1:
                 raise ValueError(f"{flag} must be at least 1, not {value}")

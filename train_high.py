@@ -3,12 +3,14 @@
 
 python train_high.py                       the whole job, on the shipped low level
 python train_high.py --low runs/low/policy
+python train_high.py --init tdgc/pretrained/high --set env.commands.vx=[-1,0.8]
 python train_high.py --resume --out runs/high
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 import math
 import sys
@@ -16,17 +18,15 @@ from typing import Any, cast
 
 import torch as th
 
-from tdgc import __version__
+from tdgc import __version__, plots
 from tdgc.commands import INDEX, CommandDecoder, default_command
-from tdgc.config import PRESETS, HighLevelConfig, HighTrainConfig, to_dict
+from tdgc.config import PRESETS, HighTrainConfig, to_dict
 from tdgc.high_env import NavigationTask, check_pair, load_low, summarise
+from tdgc.imitation import Apprentice, ApprenticePolicy
 from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.training import Phase, add_arguments, configure, run
-from tdgc.vec import TaskVecEnv, WorkerError
-
-
-def make_task(config: HighLevelConfig, low: str, robots: int, seed: int) -> NavigationTask:
-    return NavigationTask(config, low, robots, seed)
+from tdgc.vec import TaskVecEnv
+from tdgc.worker import WorkerError
 
 
 def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
@@ -44,14 +44,18 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
 
 
 def build(
-    config: HighTrainConfig, device: str, timeout: float
+    config: HighTrainConfig, device: str, imitating: bool, timeout: float
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
-    """Workers and learner."""
-    probe = NavigationTask(config.env, config.low, 1, seed=0)
+    """Workers and learner of imitation, or of reinforcement learning."""
+    guided = config.imitation.steps // config.n_envs if imitating else 0
+    env_config = config.env
+    if config.imitation.steps:  # what was imitated on all levels goes on on all
+        env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
+    probe = NavigationTask(env_config, config.low, 1, seed=0, guided=guided)
     spaces = probe.observation_space, probe.action_space
     probe.close()
     env = TaskVecEnv(
-        functools.partial(make_task, config.env, config.low),
+        functools.partial(NavigationTask, env_config, config.low, guided=guided),
         config.n_envs,
         config.workers,
         config.seed,
@@ -60,13 +64,16 @@ def build(
         timeout=timeout,
     )
     ppo = config.ppo
-    model = FastRecurrentPPO(
-        FastRecurrentPolicy,
+    learner, policy = (
+        (Apprentice, ApprenticePolicy) if imitating else (FastRecurrentPPO, FastRecurrentPolicy)
+    )
+    model = learner(
+        policy,
         env,
-        learning_rate=ppo.learning_rate,
+        learning_rate=config.imitation.learning_rate if imitating else ppo.learning_rate,
         n_steps=ppo.n_steps,
         batch_size=ppo.n_steps * config.n_envs // ppo.minibatches,
-        n_epochs=ppo.n_epochs,
+        n_epochs=config.imitation.n_epochs if imitating else ppo.n_epochs,
         gamma=ppo.gamma,
         gae_lambda=ppo.gae_lambda,
         clip_range=ppo.clip_range,
@@ -94,6 +101,8 @@ def main(arguments: list[str] | None = None) -> int:
     )
     args = parser.parse_args(arguments)
     args.assignments[:0] = PRESETS[args.preset]
+    if args.init is not None and not args.resume:
+        args.assignments.insert(0, "imitation.steps=0")  # it would unlearn what it begins with
     if args.low is not None:
         args.assignments.append(f"low={args.low}")
     try:
@@ -106,7 +115,12 @@ def main(arguments: list[str] | None = None) -> int:
             "seed": config.seed,
             "code": __version__,
         }
-        phases = [Phase(functools.partial(build, config, args.device), config.steps)]
+        imitated = min(config.imitation.steps, config.steps)
+        phases = [
+            Phase(functools.partial(build, config, args.device, imitating), until)
+            for imitating, until in ((True, imitated), (False, config.steps))
+            if until > 0
+        ]
         run(args, config, phases, meta, summarise)
     except ValueError as error:
         print(f"train_high.py: {error}", file=sys.stderr)
@@ -114,6 +128,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (WorkerError, OSError) as error:
         print(f"train_high.py: {error}", file=sys.stderr)
         return 1
+    log = args.out / "log.jsonl"
+    if log.exists():
+        plots.decision_curve(log, args.out / "training.png")
     return 0
 
 

@@ -21,11 +21,8 @@ from tdgc.config import LowLevelConfig, LowTrainConfig, to_dict
 from tdgc.low_env import LowLevelTask, summarise
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.training import Phase, add_arguments, configure, run
-from tdgc.vec import TaskVecEnv, WorkerError
-
-
-def make_task(config: LowLevelConfig, robots: int, seed: int) -> LowLevelTask:
-    return LowLevelTask(config, robots, seed)
+from tdgc.vec import TaskVecEnv
+from tdgc.worker import WorkerError
 
 
 def phases(config: LowTrainConfig, device: str) -> list[Phase]:
@@ -48,7 +45,7 @@ def build(
     """Workers and learner of one phase."""
     probe = LowLevelTask(dataclasses.replace(env_config, terrain="plane"), 1, seed=0)
     env = TaskVecEnv(
-        functools.partial(make_task, env_config),
+        functools.partial(LowLevelTask, env_config),
         config.n_envs,
         config.workers,
         config.seed,

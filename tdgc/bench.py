@@ -1,9 +1,12 @@
 """Throughput of collecting: control steps a second, Bullet's share of it, memory a robot.
 
     python -m tdgc.bench --out runs/bench
+    python -m tdgc.bench --load
 
-Robots take random actions in the low level's MDP, on a plane and on level 5 of all families, with
-one worker and with all. Writes ``bench.json`` and prints a table.
+Robots take random actions in the low level's MDP, on a plane and on all levels of all families,
+with one worker and with all. Writes ``bench.json`` and prints a table. With ``--load`` there are
+10, 100 and 1000 robots on the plane, with 1 to 8 workers, and then the learner alone, with 1 to
+16 threads; the table is in ``load.json``.
 """
 
 from __future__ import annotations
@@ -16,21 +19,35 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+import torch as th
 
-from tdgc.config import LowLevelConfig
+from tdgc.config import LowLevelConfig, LowTrainConfig
+from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.low_env import LowLevelTask
+from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
 from tdgc.vec import TaskVecEnv
 
+_COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
+#: What ``--load`` compares.
+LOAD_ROBOTS, LOAD_WORKERS, LOAD_THREADS = (10, 100, 1000), (1, 2, 4, 8), (1, 2, 4, 8, 16)
 _SETTLE_STEPS = 20  # not timed: robots drop onto their feet
 
 
-def make_task(config: LowLevelConfig, robots: int, seed: int) -> LowLevelTask:
-    """A task whose robots spread over the levels, as a training's do."""
-    task = LowLevelTask(config, robots, seed)
-    task.level = np.arange(robots) % config.levels
-    return task
+def spread_levels(env: TaskVecEnv, levels: int) -> None:
+    """New episodes for all robots, spread over the levels as a training's are."""
+    lasting = ("rng", "tiles_drawn", "command_share", "restarts")
+    env.load_state_dicts(
+        [
+            {
+                **{key: state[key] for key in lasting},
+                "level": np.arange(len(state["level"])) % levels,
+            }
+            for state in env.state_dicts()
+        ]
+    )
 
 
 def memory_mb(pids: list[int]) -> float:
@@ -52,9 +69,9 @@ def measure(config: LowLevelConfig, robots: int, workers: int, seconds: float) -
     probe = LowLevelTask(dataclasses.replace(config, terrain="plane"), 1, seed=0)
     spaces = probe.observation_space, probe.action_space
     probe.close()
-    env = TaskVecEnv(functools.partial(make_task, config), robots, workers, 0, spaces)
+    env = TaskVecEnv(functools.partial(LowLevelTask, config), robots, workers, 0, spaces)
     try:
-        env.reset()
+        spread_levels(env, config.levels)
         rng = np.random.default_rng(0)
         actions = rng.normal(0.0, 1.0, (64, robots, spaces[1].shape[0])).astype(np.float32)
         for k in range(_SETTLE_STEPS):
@@ -77,34 +94,114 @@ def measure(config: LowLevelConfig, robots: int, workers: int, seconds: float) -
     }
 
 
+def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
+    """Control steps a second that the low level's learner takes in, for about ``seconds``.
+
+    Each is taken ``n_epochs`` times, in minibatches, forwards and backwards through both networks.
+    """
+    probe, ppo = LowLevelTask(config.env, 1, seed=0), config.ppo
+    maps = (*probe.observation_mirror, *probe.action_mirror)
+    policy = AsymmetricActorCriticPolicy(
+        probe.observation_space,
+        probe.action_space,
+        lambda _: ppo.learning_rate,
+        actor_dim=probe.actor_dim,
+        mirror=Mirror(*(tuple(part.tolist()) for part in maps)) if ppo.mirror else None,
+        net_arch={"pi": list(ppo.actor), "vf": list(ppo.critic)},
+        activation_fn=ACTIVATIONS[ppo.activation],
+    )
+    probe.close()
+    seen = th.randn(ppo.batch_size, probe.obs_dim)
+    actions = th.randn(ppo.batch_size, probe.action_space.shape[0])
+
+    def update() -> None:
+        values, log_prob, _ = policy.evaluate_actions(seen, actions)
+        policy.optimizer.zero_grad()
+        th.autograd.backward((values.square() - log_prob).mean())
+        policy.optimizer.step()
+
+    before = th.get_num_threads()
+    th.set_num_threads(threads)
+    try:
+        update()  # not timed: the first one makes the optimiser's state
+        started, updates = time.perf_counter(), 0
+        while time.perf_counter() - started < seconds:
+            update()
+            updates += 1
+        elapsed = time.perf_counter() - started
+    finally:
+        th.set_num_threads(before)
+    return updates * ppo.batch_size / (elapsed * ppo.n_epochs)
+
+
+def head(*names: str) -> None:
+    print(names[0].ljust(8) + "".join(name.rjust(11) for name in names[1:]))
+
+
+def collected(name: str, workers: int, row: dict[str, float]) -> None:
+    """A line of the table."""
+    share = f"{100 * row['bullet_share']:.0f} %"
+    print(
+        f"{name:<8}{workers:>11}{row['steps_per_s']:>11.0f}{share:>11}"
+        f"{row['mb_per_robot']:>11.1f}{row['mb_total']:>11.0f}",
+        flush=True,
+    )
+
+
+def compare_grounds(robots: int, workers: int, seconds: float) -> dict[str, Any]:
+    """bench.json: ground -> workers, "1" or "all" -> ``measure``."""
+    families = ("rough", "pillar", "stair", "gap", "tilt")
+    result: dict[str, dict[str, dict[str, float]]] = {"plane": {}, "terrain": {}}
+    head("ground", *_COLUMNS)
+    for ground, rows in result.items():
+        terrain: Literal["plane", "tiles"] = "plane" if ground == "plane" else "tiles"
+        config = LowLevelConfig(terrain=terrain, families=families)
+        for name, number in (("1", 1), ("all", workers)):
+            rows[name] = measure(config, robots, number, seconds)
+            collected(ground, number, rows[name])
+    return result
+
+
+def compare_loads(seconds: float) -> dict[str, Any]:
+    """load.json: "collect": robots -> workers -> ``measure``, "learn": threads -> ``learn``, and
+    the usable "cores"."""
+    collect: dict[str, dict[str, dict[str, float]]] = {}
+    head("robots", *_COLUMNS)
+    for robots in LOAD_ROBOTS:
+        rows = collect.setdefault(str(robots), {})
+        for workers in LOAD_WORKERS:
+            rows[str(workers)] = measure(LowLevelConfig(), robots, workers, seconds)
+            collected(str(robots), workers, rows[str(workers)])
+    learned: dict[str, float] = {}
+    print()
+    head("threads", "steps/s")
+    for threads in LOAD_THREADS:
+        learned[str(threads)] = learn(LowTrainConfig(), threads, seconds)
+        print(f"{threads:<8}{learned[str(threads)]:>11.0f}", flush=True)
+    return {"cores": usable_cores(), "collect": collect, "learn": learned}
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--robots", type=int, default=100)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument(
+        "--workers", type=workers_flag, default="auto", metavar="N", help="all of them (one a core)"
+    )
     parser.add_argument("--seconds", type=float, default=10.0, help="a measurement (10)")
+    parser.add_argument("--load", action="store_true", help="compare robots, workers and threads")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     args = parser.parse_args(arguments)
+    if args.workers == "auto":
+        args.workers = auto_workers(args.robots, usable_cores())
     if not 1 <= args.workers <= args.robots:
         print("tdgc.bench: --workers must be 1 to the number of robots", file=sys.stderr)
         return 2
-    families = ("rough", "pillar", "stair", "gap", "tilt")
-    result: dict[str, dict[str, dict[str, float]]] = {}
-    print("ground   workers   steps/s   in Bullet   MB/robot   MB")
-    for ground in ("plane", "terrain"):
-        config = LowLevelConfig(
-            terrain="plane" if ground == "plane" else "tiles", families=families
-        )
-        for name, workers in (("1", 1), ("all", args.workers)):
-            row = measure(config, args.robots, workers, args.seconds)
-            result.setdefault(ground, {})[name] = row
-            print(
-                f"{ground:<8}{workers:>8}{row['steps_per_s']:>10.0f}"
-                f"{100 * row['bullet_share']:>10.0f} %{row['mb_per_robot']:>10.1f}"
-                f"{row['mb_total']:>7.0f}",
-                flush=True,
-            )
+    if args.load:
+        name, result = "load.json", compare_loads(args.seconds)
+    else:
+        name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "bench.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
+    (args.out / name).write_text(json.dumps(result, indent=2), encoding="utf-8")
     return 0
 
 

@@ -119,19 +119,21 @@ class CommandDecoder:
         return np.concatenate([continuous, gait_embedding(self.gait(action))], axis=-1)
 
     def encode(self, command: ArrayLike) -> NDArray[np.float64]:
-        """The action in the middle of those that decode to ``command``: (15,) -> (13,).
+        """The action in the middle of those that decode to ``command``: (..., 15) -> (..., 13).
 
         Raises:
             ValueError: a command outside the bounds, named with them.
         """
         c = np.asarray(command, dtype=np.float64)
         for j, name in enumerate(CONTINUOUS):
-            if not self.low[j] <= c[j] <= self.high[j]:
-                raise ValueError(f"{name} {c[j]} is outside [{self.low[j]}, {self.high[j]}]")
+            inside = (self.low[j] <= c[..., j]) & (c[..., j] <= self.high[j])
+            if not inside.all():
+                worst = c[..., j][~inside].flat[0]
+                raise ValueError(f"{name} {worst} is outside [{self.low[j]}, {self.high[j]}]")
         low, high = self.low[:12], self.high[:12]
-        x = 2.0 * (c[:12] - low) / np.where(high > low, high - low, 1.0) - 1.0
-        gait = (gait_index(c) + 0.5) / 2.0 - 1.0
-        return self.action_limit * np.append(x, gait)
+        x = 2.0 * (c[..., :12] - low) / np.where(high > low, high - low, 1.0) - 1.0
+        gait = (gait_index(c)[..., None] + 0.5) / 2.0 - 1.0
+        return self.action_limit * np.concatenate([x, gait], axis=-1)
 
 
 def gait_index(commands: NDArray[np.floating]) -> NDArray[np.int64]:

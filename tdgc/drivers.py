@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Protocol
 
@@ -11,11 +11,19 @@ from numpy.typing import NDArray
 
 from tdgc import policies
 from tdgc.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, from_dict
+from tdgc.config import (
+    CommandRanges,
+    ConfigError,
+    HighLevelConfig,
+    LowLevelConfig,
+    RobotConfig,
+    from_dict,
+)
 from tdgc.high_env import SEMANTIC, check_pair, high_layout, observe_high
 from tdgc.locomotion import Locomotion
 from tdgc.policies import Policy
 from tdgc.robot import Array, wrap_angle
+from tdgc.teacher import Teacher
 
 
 class Driver(Protocol):
@@ -50,7 +58,7 @@ class GoToGoal:
     top_speed: float = 0.5  # m/s
     distance_gain: float = 1.0  # 1/s
     heading_gain: float = 1.5  # 1/s
-    swing_height: float = 0.16  # m
+    swing_height: float = 0.2  # m
 
     def law(self, position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
         """Forward speed and yaw rate: positions (M, 2), headings (M,), goals (M, 2)."""
@@ -79,6 +87,30 @@ class BaselineDriver:
         state = self._loco.world.state
         speed, turn = self.law.law(state.position[:, :2], state.yaw, self._goal)
         self._command[:, INDEX["vx"]], self._command[:, INDEX["yaw_rate"]] = speed, turn
+        return self._command
+
+
+class TeacherDriver:
+    """Drives robots by the scripted teacher, decided as often as the hierarchy decides.
+
+    It is told what the hierarchy has to find out, so it is no rival: it shows what the low level
+    can do when it is told the right thing.
+    """
+
+    def __init__(self) -> None:
+        self.config = HighLevelConfig(cues="none")
+        self.bounds = CommandRanges()
+        self.action: NDArray[np.floating] | None = None
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        self._loco, self._goal = loco, goal
+        assert loco.world.field is not None  # episodes run on tiles
+        self._teacher = Teacher(loco.world.field, [family] * loco.num_robots)
+        self._teacher.begin(np.arange(loco.num_robots), goal)
+
+    def command(self, step: int) -> Array:
+        if step % self.config.decimation == 0:
+            self._command = self._teacher.commands(self._loco, self._goal)
         return self._command
 
 
@@ -132,8 +164,8 @@ def load_high(
 
     Raises:
         ValueError: a file that cannot be used, one that is no high level, or one that was trained
-            on a low level with another observation, control rate or narrower commands; the message
-            names the mismatch.
+            on a low level with another robot, observation, control rate or narrower commands; the
+            message names the mismatch.
     """
     high = policies.load(path)
     if high.kind != "lstm" or high.action_dim != NUM_ACTIONS:
@@ -144,6 +176,12 @@ def load_high(
         observation = high.meta["low"]["observation"]
     except (KeyError, TypeError) as error:
         raise ConfigError(f"{path}: its meta lacks what it was trained on") from error
+    for field in fields(RobotConfig):
+        wanted, given = (getattr(c.robot, field.name) for c in (trained_on, low_config))
+        if wanted != given:
+            raise ConfigError(
+                f"{path}: trained for a low level with robot.{field.name} {wanted}, not {given}"
+            )
     size = sum(width for _, width in high_layout(config.cues))
     for what, wanted, given in (
         ("a high level that observes {} values", size, high.obs_dim),

@@ -31,7 +31,7 @@ from tdgc.policies import Policy
 from tdgc.rewards import CONTACT_FORCE
 from tdgc.robot import NUM_JOINTS, Array, RobotState
 from tdgc.terrain import ALL_FAMILIES, EVAL_STREAM, MAX_LEVEL, Tile, TileField, make_tile, tile_rng
-from tdgc.vec import one_blas_thread
+from tdgc.worker import one_blas_thread
 
 HORIZON = 20.0  # s (benchmark)
 OUTCOMES = ("reached", "fell", "collided", "left_tile", "timeout")

@@ -30,6 +30,7 @@ from tdgc.low_env import GOAL_RADIUS, TaskEnv, is_fallen
 from tdgc.policies import Policy
 from tdgc.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.state import State, copies, fill
+from tdgc.teacher import Teacher
 from tdgc.terrain import FAMILIES, draw_start_goal
 from tdgc.tiles import TrainingTiles
 from tdgc.world import World
@@ -44,6 +45,8 @@ PROBE_RANGE = 0.5  # m, deeper and higher looks the same
 #: ahead, staggered over four lines: an edge across the way is found to 5 cm, and a pillar on it,
 #: 20 cm wide at least, meets a probe.
 PROBES: Array = np.array([(0.05 * i - 0.25, (0.1, -0.3, 0.3, -0.1)[i % 4]) for i in range(32)])
+_GUIDANCE = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
+
 #: The semantic cue: one-hot over the families, and one place for "unknown".
 SEMANTIC = (*FAMILIES, "unknown")
 
@@ -200,6 +203,9 @@ class NavigationTask:
         seed: of everything random here.
         training: draw disturbances and let the curriculum move levels.
         visual: keep what pictures of the ground need.
+        guided: decisions of each robot in which a teacher helps, see ``tdgc.imitation``. Its
+            actions follow the observation, and it drives a share of the episodes that falls from
+            all to none over the first ``_GUIDANCE`` of these decisions.
     """
 
     def __init__(
@@ -210,6 +216,7 @@ class NavigationTask:
         seed: int,
         training: bool = True,
         visual: bool = False,
+        guided: int = 0,
     ) -> None:
         self.config, self._visual = config, visual
         self.num_robots = m = num_robots
@@ -235,8 +242,15 @@ class NavigationTask:
         self._actions = np.zeros((2, m, NUM_ACTIONS))
         self._commands = np.zeros((3, m, 15))
         self.stats: dict[str, float] = {}
+        families = [config.families[f] for f in self.family]
+        self.teacher = Teacher(self.field, families) if guided else None
+        self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
+        self._led = np.zeros(m, dtype=bool)
+        self._taught = np.zeros((m, NUM_ACTIONS))
         size = sum(width for _, width in high_layout(config.cues))
         self.actor_dim = size
+        if guided:
+            size += NUM_ACTIONS
         limit = config.action_limit
         self.action_space = gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
@@ -268,6 +282,10 @@ class NavigationTask:
         self.locomotion.place(
             index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
         )
+        if self.teacher is not None:
+            self.teacher.begin(index, self.goal)
+            share = 1.0 - self._decisions[0] / (_GUIDANCE * self._guided)
+            self._led[index] = rng.uniform(size=n) < share
 
     def _width(self) -> Array:
         """How wide each robot's disturbances are: they grow with its level."""
@@ -291,6 +309,8 @@ class NavigationTask:
             ValueError: a value that is not finite.
         """
         loco, c = self.locomotion, self.config
+        actions = np.where(self._led[:, None], self._taught, actions)
+        self._decisions += 1
         self._actions = np.stack([self.decoder.normalise(actions), self._actions[0]])
         commands = self.decoder.decode(actions)
         share = command_share(commands, self.decoder)
@@ -341,8 +361,8 @@ class NavigationTask:
         return is_fallen(world) | ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
 
     def observe(self) -> NDArray[np.float32]:
-        """o^H, (M, actor_dim)."""
-        return observe_high(
+        """o^H, (M, actor_dim), and with a teacher its actions, (M, 13)."""
+        seen = observe_high(
             self.locomotion,
             self.goal,
             self.elapsed / self.horizon,
@@ -350,6 +370,11 @@ class NavigationTask:
             self.family_index,
             self.config.cues,
         )
+        if self.teacher is None:
+            return seen
+        commands = self.teacher.commands(self.locomotion, self.goal)
+        self._taught = self.decoder.encode(commands)
+        return np.concatenate([seen, self._taught], axis=1, dtype=np.float32)
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -402,7 +427,7 @@ class NavigationTask:
         gait = gait_index(commands)
         for col, family in enumerate(self.config.families):
             mine = self.family == col
-            ended = done[mine[done]]
+            ended = done[mine[done] & ~self._led[done]]
             add(f"family/{family}/count", mine.sum())
             add(f"family/{family}/level", self.curriculum.levels[mine].sum())
             add(f"family/{family}/episodes", ended.size)
@@ -429,6 +454,8 @@ class NavigationTask:
             "next_push": self._next_push,
             "actions": self._actions,
             "commands": self._commands,
+            "led": self._led,
+            "taught": self._taught,
         }
 
     def state_dict(self) -> State:
@@ -436,6 +463,7 @@ class NavigationTask:
         return {
             "rng": self.rng.bit_generator.state,
             "tiles_drawn": self.tiles.drawn,
+            "decisions": self._decisions.copy(),
             "curriculum": self.curriculum.state_dict(),
             "episodes": {
                 **copies(self._arrays()),
@@ -454,6 +482,7 @@ class NavigationTask:
         self.rng.bit_generator.state = state["rng"]
         self.curriculum.load_state_dict(state["curriculum"])
         self.tiles.drawn = int(state["tiles_drawn"])
+        self._decisions[:] = state["decisions"]
         if "episodes" not in state:
             self.restart()
             return
@@ -462,6 +491,8 @@ class NavigationTask:
         self.tiles.load_state_dict(episodes["tiles"])
         self.locomotion.world.upload_terrain()
         self.locomotion.load_state_dict(episodes["locomotion"])
+        if self.teacher is not None:
+            self.teacher.begin(np.arange(self.num_robots), self.goal)
 
     def close(self) -> None:
         """Disconnect from Bullet."""

@@ -124,6 +124,7 @@ class Locomotion:
         self.payload = np.zeros(num_robots)
         feet, _ = foot_kinematics(self.nominal[None], np.zeros((1, NUM_JOINTS)))
         self._stand = FOOT_RADIUS - feet[0, :, 2].min()  # trunk above the soles, nominal pose
+        self._pose = self._pose_of = np.empty(0)  # the last ``pose`` and what it followed from
 
     @property
     def layout(self) -> tuple[tuple[str, int], ...]:
@@ -134,7 +135,13 @@ class Locomotion:
         """q0, the pose that actions start from and joint errors refer to, (M, 12) rad."""
         if not self.robot.commanded_pose:
             return np.tile(self.nominal, (self.num_robots, 1))
-        return commanded_pose(self.robot, self.command, swing_profile(self.clock.phases))
+        # An action is taken from the pose that was observed, if nobody changed anything between.
+        follows = np.concatenate([self.command, self.clock.phases], axis=1)
+        if not np.array_equal(follows, self._pose_of):
+            swing = swing_profile(self.clock.phases)
+            self._pose, self._pose_of = commanded_pose(self.robot, self.command, swing), follows
+            self._pose.setflags(write=False)
+        return self._pose
 
     def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:
         """Stand the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)

@@ -24,10 +24,9 @@ from tdgc.terrain import (
     MAX_LEVEL,
     TILE_SIZE,
     TRENCH_DEPTH,
-    TRENCH_SPACING,
-    ZONE,
     Tile,
     draw_start_goal,
+    trench_centres,
 )
 from tdgc.tiles import FLAT, TrainingTiles
 from tdgc.world import World
@@ -79,17 +78,22 @@ _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap
 # Crossing: trot climbs best, and with all gaits alike the worst one decides how far levels rise.
 _FREE_GAITS = (0.2, 0.2, 0.25, 0.35)
 _CROSSING_GAITS = (0.8, 0.05, 0.075, 0.075)
-# Over trenches half of the crossings leap: pronk with a stride of about the stance length puts
-# front and rear feet on the same lines, and a trench fits between two of them if the steps are
-# timed, which the crossing does and the decision level has to learn.
-_TRENCH_GAITS = (0.3, 0.5, 0.1, 0.1)
-_LEAP_SPEED = (0.85, 1.0)  # m/s
-_LEAP_SWING = 0.09  # m at most: four legs drawn up at once drop the trunk
-_STRIDE = (0.33, 0.42)  # m, three of 0.417 m make a trench's distance to the next
+# Over trenches most crossings leap: pronk with a stride of about the stance length puts front and
+# rear feet on the same lines, and a trench fits between two of them if the steps are timed, which
+# the crossing does and the decision level has to learn. Other gaits fall into the first trench, and
+# with half of the crossings in them levels stayed below 2.
+_TRENCH_GAITS = (0.15, 0.85, 0.0, 0.0)
+_LEAP_SPEED = (0.9, 1.0)  # m/s
+_LEAP_SWING = 0.07  # m at most: four legs drawn up at once drop the trunk
+_STRIDE = (0.35, 0.39)  # m; the robot is slow to start with longer ones
+#: m/s, what leaps are timed for while the robot is slower. At the 2 Hz of a start from rest they
+#: threw every robot down.
+LEAP_START = 1.0
 # Where pronk lands, measured in low-9 at about 1 m/s and 2.5 Hz: front feet so far ahead of the
 # trunk as it is at clock 0, and rear feet so much further behind them than commanded, since they
 # touch down sooner.
 _LANDING = (0.20, 0.055)  # m
+_CENTRES = np.array([trench_centres(level / MAX_LEVEL) for level in range(MAX_LEVEL + 1)])
 _TIMING_GAIN = 1.5  # share of the frequency for each cycle that the feet are out of time
 # Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet land
 # on the same lines, so that a trench fits between two of them. Drawn evenly, such commands are too
@@ -107,23 +111,24 @@ _GROW_CONTACT = 0.7
 
 
 def straddling_frequency(
-    x: Array, speed: Array, clock: Array, stride: Array, length: Array
+    x: Array, speed: Array, clock: Array, stride: Array, length: Array, centres: Array
 ) -> Array:
-    """Step frequency in Hz at which pronk lands at either side of the trenches, all (M,).
+    """Step frequency in Hz at which pronk lands at either side of the trenches, (M,).
 
     Args:
-        x: m, trunk along the tile.
-        speed: m/s, forward.
-        clock: the gait's, 0 where the feet touch down.
-        stride, length: m, from one landing to the next, and between front and rear feet.
+        x: (M,) m, trunk along the tile.
+        speed: (M,) m/s, forward.
+        clock: (M,) the gait's, 0 where the feet touch down.
+        stride, length: (M,) m, from one landing to the next, and between front and rear feet.
+        centres: (M, n) m along the tile, of the trenches.
 
     Feed-forward keeps the stride; to it comes what brings the lines on which front and rear feet
     land half a stride before the centre of the nearest trench.
     """
-    centres = ZONE[0] + TRENCH_SPACING * (np.arange(4) + 0.5)
     front, rear = _LANDING[0], _LANDING[0] - length - _LANDING[1] + stride  # the rear's next line
     landing = x + 0.5 * (front + rear)
-    trench = centres[np.abs(landing[:, None] - centres).argmin(axis=1)]
+    nearest = np.abs(landing[:, None] - centres).argmin(axis=1)
+    trench = centres[np.arange(len(x)), nearest]
     late = np.mod((landing - trench) / stride - clock, 1.0) - 0.5  # 0.5 turns -0.5 strides to 0
     return np.asarray(speed / stride * (1.0 + _TIMING_GAIN * late))
 
@@ -451,10 +456,11 @@ class LowLevelTask:
             command = self.locomotion.command[leaping]
             frequency = straddling_frequency(
                 (state.position[:, 0] - self._origin[:, 0])[leaping],
-                np.maximum(state.heading_vel[leaping, 0], 0.0),
+                np.maximum(state.heading_vel[leaping, 0], LEAP_START),
                 self.locomotion.clock.clock[leaping],
                 self._stride[leaping],
                 command[:, INDEX["stance_length"]],
+                _CENTRES[self.level[leaping]],
             )
             j = INDEX["frequency"]
             self.locomotion.command[leaping, j] = np.clip(frequency, self._low[j], self._high[j])

@@ -29,7 +29,7 @@ from tdgc.gaits import FEET, GAITS
 from tdgc.low_env import GOAL_RADIUS
 from tdgc.recording import Recording, spans, stretches
 from tdgc.robot import Array, wrap_angle
-from tdgc.terrain import TILE_SIZE
+from tdgc.terrain import ALL_FAMILIES, TILE_SIZE
 
 # Okabe and Ito's palette, which colour-blind eyes tell apart.
 POLICY_COLOURS = {"tdgc": "#0072B2", "tdgc-tuned": "#009E73", "gp": "#D55E00"}
@@ -374,30 +374,49 @@ def _draw_command(
 
 def training_curve(log: Path, out: Path) -> None:
     """The low level's run: reward, tracking and contact by gait, terrain levels (log.jsonl)."""
-    rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-    steps = [row["steps"] / 1e6 for row in rows]
-
-    def draw(axis: Any, key: str, label: str) -> None:
-        points = [(s, row[key]) for s, row in zip(steps, rows, strict=True) if key in row]
-        if points:
-            axis.plot(*zip(*points, strict=True), label=label)
-
-    figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, layout="constrained")
     panels = [
-        ("reward a step", [("reward/total", "total")]),
-        ("velocity RMSE (m/s)", [(f"tracking/{g}_velocity_rmse", g) for g in GAITS]),
-        ("yaw rate RMSE (rad/s)", [(f"tracking/{g}_yaw_rate_rmse", g) for g in GAITS]),
-        ("contact as desired", [(f"tracking/{g}_contact_match", g) for g in GAITS]),
-        ("falls a minute", [("falls_per_minute", "all")]),
-        ("terrain level", [(k, k[6:]) for k in rows[-1] if k.startswith("level/")]),
+        ("reward a step", {"reward/total": "total"}),
+        ("velocity RMSE (m/s)", {f"tracking/{g}_velocity_rmse": g for g in GAITS}),
+        ("yaw rate RMSE (rad/s)", {f"tracking/{g}_yaw_rate_rmse": g for g in GAITS}),
+        ("contact as desired", {f"tracking/{g}_contact_match": g for g in GAITS}),
+        ("falls a minute", {"falls_per_minute": "all"}),
+        ("terrain level", {f"level/{f}": f for f in ALL_FAMILIES}),
     ]
+    _curves(log, out, panels, "million control steps")
+
+
+def decision_curve(log: Path, out: Path) -> None:
+    """The high level's run: reward, success, levels and pronk by family (log.jsonl).
+
+    A dotted line is where imitation ends. Until then success is that of the episodes which the
+    teacher does not drive.
+    """
+    panels = [
+        ("reward a decision", {"reward/total": "total"}),
+        ("success", {f"success/{f}": f for f in ALL_FAMILIES}),
+        ("level", {f"level/{f}": f for f in ALL_FAMILIES}),
+        ("share of decisions in pronk", {f"gait/{f}_pronk": f for f in ALL_FAMILIES}),
+    ]
+    _curves(log, out, panels, "million decisions")
+
+
+def _curves(log: Path, out: Path, panels: list[tuple[str, dict[str, str]]], unit: str) -> None:
+    """Panels of (title, {key of a row: label}) against steps."""
+    rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    columns = (len(panels) + 1) // 2
+    figure, axes = plt.subplots(2, columns, figsize=(12, 6), sharex=True, layout="constrained")
+    imitated = [row["steps"] / 1e6 for row in rows if "train/imitation_loss" in row]
     for axis, (title, series) in zip(axes.ravel(), panels, strict=True):
-        for key, label in series:
-            draw(axis, key, label)
-        axis.set_title(title)
-        axis.grid(alpha=0.3)
+        for key, label in series.items():
+            points = [(row["steps"] / 1e6, row[key]) for row in rows if key in row]
+            if points:
+                axis.plot(*zip(*points, strict=True), label=label)
         if len(axis.lines) > 1:
             axis.legend(fontsize=7)
+        if imitated:
+            axis.axvline(imitated[-1], color="0.5", linestyle=":")
+        axis.set_title(title)
+        axis.grid(alpha=0.3)
     for axis in axes[1]:
-        axis.set_xlabel("million control steps")
+        axis.set_xlabel(unit)
     _save(figure, out)

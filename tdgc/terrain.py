@@ -242,14 +242,31 @@ def gap(section: Section, width: float, rng: np.random.Generator) -> FloatArray:
     Widths are quantised: n = round(w / cell) >= 1 samples are lowered, and as the walls lean over
     one cell on either side, a trench measures (n - 1, n, n + 1) cells at bottom, half depth, top.
     """
+    first, lowered = _trenches(section, width)
+    relief = np.zeros(TILE_SAMPLES)
+    for sample in first:
+        relief[sample : sample + lowered] = -TRENCH_DEPTH
+    return relief[:, None]
+
+
+def _trenches(section: Section, width: float) -> tuple[NDArray[np.int64], int]:
+    """First lowered sample of each trench, and how many are lowered."""
     lowered = max(1, round(width / CELL))
     spacing = round(TRENCH_SPACING / CELL)
-    relief = np.zeros(TILE_SAMPLES)
-    for k in range(round((section.end - section.begin) / TRENCH_SPACING)):
-        # Centres fall between two samples, so an odd n sits half a cell towards the start.
-        first = _sample(section.begin) + ((2 * k + 1) * spacing - lowered + 1) // 2
-        relief[first : first + lowered] = -TRENCH_DEPTH
-    return relief[:, None]
+    count = round((section.end - section.begin) / TRENCH_SPACING)
+    # Centres fall between two samples, so an odd n sits half a cell towards the start.
+    halves = (2 * np.arange(count) + 1) * spacing - lowered + 1
+    return _sample(section.begin) + halves // 2, lowered
+
+
+def trench_centres(difficulty: float) -> FloatArray:
+    """Middle of each trench of a Gap tile along x, (4,) m.
+
+    Raises:
+        ValueError: a difficulty out of range.
+    """
+    first, lowered = _trenches(WHOLE_ZONE, difficulty_parameter("gap", difficulty))
+    return np.asarray(CELL * (first + 0.5 * (lowered - 1)))
 
 
 def tilt(section: Section, angle: float, rng: np.random.Generator) -> FloatArray:

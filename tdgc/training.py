@@ -39,9 +39,11 @@ from tqdm import tqdm
 
 from tdgc import __version__, policies
 from tdgc.config import Config, ConfigError, from_dict, read_json, to_dict, with_overrides
+from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.errors import InputError
 from tdgc.state import State, join, split
-from tdgc.vec import TaskVecEnv, WorkerError
+from tdgc.vec import TaskVecEnv
+from tdgc.worker import WorkerError
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
 _VERSION = 2
@@ -353,7 +355,10 @@ class RunCallback(BaseCallback):
             returns = [e["r"] for e in self.model.ep_info_buffer or ()]
             values["episode/return"] = float(np.mean(returns))
             values["episode/length"] = float(np.mean(lengths))
-        for name in ("value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "std"):
+        for name in (
+            "imitation_loss", "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction",
+            "std",
+        ):  # fmt: skip
             number = self.logger.name_to_value.get(f"train/{name}")
             if number is not None:
                 values[f"train/{name}"] = float(number)
@@ -469,7 +474,10 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
     """The flags of both trainers; ``out`` is the default run folder."""
     parser.add_argument("--seed", type=int, help="of everything random (42)")
     parser.add_argument("--n-envs", type=int, help="robots altogether")
-    parser.add_argument("--workers", type=int, help="processes that simulate")
+    parser.add_argument(
+        "--workers", type=workers_flag, metavar="N",
+        help="processes that simulate, or auto: one a core, each with 10 robots at least",
+    )  # fmt: skip
     parser.add_argument(
         "--worker-timeout", type=float, default=300.0, metavar="S",
         help="start a worker anew that is silent for S seconds (300)",
@@ -503,8 +511,12 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     elif stored.exists():
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
-    given = [f"{k}={v}" for k, v in flags.items() if v is not None]
-    return with_overrides(config, [*given, *args.assignments])
+    given = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
+    config = with_overrides(config, [*given, *args.assignments])
+    if args.workers == "auto" and not args.resume:  # a run goes on with as many as it began with
+        workers = auto_workers(to_dict(config)["n_envs"], usable_cores())
+        config = with_overrides(config, [f"workers={workers}"])
+    return config
 
 
 def run(

@@ -1,27 +1,12 @@
-"""Many robots in a few worker processes behind Stable-Baselines3's VecEnv.
-
-Each worker holds one task of some robots. Actions, observations, rewards and flags live in shared
-memory that dies with its processes; the pipes carry single words and now and then a state. Robots
-that blow up are reset where they are simulated, and a worker that fails can be started anew.
-"""
+"""Many robots in a few workers behind Stable-Baselines3's VecEnv; workers that fail are mended."""
 
 from __future__ import annotations
 
 import atexit
-import contextlib
 import itertools
-import multiprocessing as mp
-import os
-import signal
-import threading
-import time
-import traceback
 from collections import deque
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from multiprocessing.sharedctypes import RawArray
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -29,56 +14,13 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from tdgc.state import State, copies
+from tdgc.worker import Arrays, Link, MakeTask, ProcessLink, WorkerError
 
-#: Observations and rewards are scaled to be of order one; beyond this a robot has blown up. For the
-#: low level it means 50 m/s, 400 rad/s or 10 m above the ground.
-SANE = 100.0
 #: Faults of workers within so many steps that stop a run. A fault of the code comes back at once
 #: or in every episode, and the low level's last 1000 steps; one of the machine does not.
 FAULTS, FAULT_STEPS = 3, 1000
 # s to start in: ten times what imports and 60 robots' worlds took on a core shared by ten.
 _START_SECONDS = 600.0
-
-
-class Task(Protocol):
-    """An MDP of M robots, as ``tdgc.low_env.LowLevelTask`` is one.
-
-    ``state_dict()["rng"]`` is the state of all that is random in it and ``["episodes"]`` that of
-    the episodes under way; a task that loads a state without them begins new ones. ``forget``
-    changes nothing of the state, and makes what follows depend on nothing else.
-    """
-
-    num_robots: int
-    actor_dim: int
-    observation_space: gym.spaces.Box[Any]
-    action_space: gym.spaces.Box[Any]
-
-    def reset(self, index: NDArray[np.integer]) -> None: ...
-
-    def step(
-        self, actions: NDArray[np.floating]
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]: ...
-
-    def observe(self) -> NDArray[np.float32]: ...
-
-    def restart(self) -> None: ...
-
-    def forget(self) -> None: ...
-
-    def take_stats(self) -> dict[str, float]: ...
-
-    def state_dict(self) -> State: ...
-
-    def load_state_dict(self, state: State) -> None: ...
-
-    def close(self) -> None: ...
-
-
-MakeTask = Callable[[int, int], Task]  # (number of robots, seed) -> task
-
-
-class WorkerError(RuntimeError):
-    """A worker died, hung or raised; the message carries its own traceback if it has one."""
 
 
 @dataclass(frozen=True)
@@ -108,167 +50,14 @@ def worker_seed(seed: int, worker: int, restarts: int = 0) -> int:
     return int(np.random.SeedSequence([seed, worker, restarts]).generate_state(1)[0])
 
 
-class _Shared:
-    """The arrays of all robots, in memory shared with the workers."""
-
-    def __init__(self, num: int, obs_dim: int, action_dim: int) -> None:
-        self._shape = (num, obs_dim, action_dim)
-        self._raw = {
-            "actions": RawArray("f", num * action_dim),
-            "obs": RawArray("f", num * obs_dim),
-            "last_obs": RawArray("f", num * obs_dim),
-            "rewards": RawArray("f", num),
-            "terminated": RawArray("b", num),
-            "truncated": RawArray("b", num),
-        }
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Views by name: actions, obs, last_obs (of episodes that ended), rewards, flags."""
-        num, obs_dim, action_dim = self._shape
-        width = {"actions": action_dim, "obs": obs_dim, "last_obs": obs_dim}
-        views: dict[str, NDArray[Any]] = {}
-        for name, raw in self._raw.items():
-            dtype = np.float32 if name in (*width, "rewards") else np.int8
-            flat: NDArray[Any] = np.frombuffer(raw, dtype=dtype)
-            views[name] = flat.reshape(num, width[name]) if name in width else flat
-        return views
-
-
-def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
-    """One step of a worker's robots; those whose episode ended are reset.
-
-    A robot that blew up gets no reward and is truncated, with its observation before the step as
-    the last one. Returns how many did.
-
-    Raises:
-        FloatingPointError: the task is not finite even after a reset.
-    """
-    reward, terminated, truncated = task.step(views["actions"])
-    obs = task.observe()
-    blown = ~((np.abs(obs) <= SANE).all(axis=1) & (np.abs(reward) <= SANE))
-    # A robot with a NaN leaves Bullet's broad phase in disorder for good: the others of its client
-    # fall through the ground. So the worlds are built anew, which ends every episode in them.
-    poisoned = not (np.isfinite(obs).all() and np.isfinite(reward).all())
-    obs[blown], reward[blown] = views["obs"][blown], 0.0
-    terminated &= ~blown
-    truncated |= blown | (poisoned & ~terminated)
-    done = np.flatnonzero(terminated | truncated)
-    if done.size:
-        views["last_obs"][done] = obs[done]
-        if poisoned:
-            task.take_stats()  # its sums are not finite either
-            task.restart()
-        else:
-            task.reset(done)
-        obs[done] = task.observe()[done]
-        if not np.isfinite(obs).all():
-            raise FloatingPointError("observations are not finite after a reset")
-    views["obs"][:] = obs
-    views["rewards"][:] = reward
-    views["terminated"][:] = terminated
-    views["truncated"][:] = truncated
-    return int(blown.sum())
-
-
-def _load(task: Task, views: dict[str, NDArray[Any]], state: State) -> None:
-    """Go on from a worker's state; what was seen last is part of it, for it may be noisy."""
-    task.load_state_dict(state)
-    views["obs"][:] = state["obs"] if "obs" in state else task.observe()
-
-
 def _lasting(state: State) -> State:
     """A worker's state without the episodes under way."""
     under_way = ("episodes", "obs", "returns", "lengths")
     return {key: value for key, value in state.items() if key not in under_way}
 
 
-def _end_with_parent() -> None:
-    """End this process when its parent has, whatever it is busy with."""
-    parent = mp.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _work(
-    pipe: Connection,
-    make_task: MakeTask,
-    rows: slice,
-    seed: int,
-    shared: _Shared,
-    state: State | None = None,
-) -> None:
-    """A worker's life: tell its state, then answer one word at a time until told to close.
-
-    With the ``state`` of a worker that failed it takes over all but the randomness.
-    """
-    # What a terminal or a batch system sends to all processes is the parent's to answer.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    task: Task | None = None
-    try:
-        views = {name: view[rows] for name, view in shared.arrays().items()}
-        task = make_task(rows.stop - rows.start, seed)
-        if state is not None:
-            _load(task, views, {**state, "rng": task.state_dict()["rng"]})
-        busy, blow_ups = 0.0, 0
-        pipe.send(task.state_dict())
-        while True:
-            word, argument = pipe.recv()
-            started = time.perf_counter()
-            answer: Any = None
-            if word == "step":
-                blow_ups += _step(task, views)
-            elif word == "restart":
-                task.restart()
-                views["obs"][:] = task.observe()
-            elif word == "forget":
-                task.forget()
-            elif word == "load":
-                _load(task, views, argument)
-            elif word == "state":
-                answer = {**task.state_dict(), "obs": views["obs"].copy()}
-            elif word == "stats":
-                answer = {**task.take_stats(), "busy_seconds": busy, "blow_ups": float(blow_ups)}
-                blow_ups = 0
-            elif word == "close":
-                pipe.send(None)
-                return
-            busy += time.perf_counter() - started
-            pipe.send(answer)
-    except (EOFError, BrokenPipeError):
-        pass  # the parent is gone
-    except Exception:
-        with contextlib.suppress(OSError):
-            pipe.send(WorkerError(traceback.format_exc()))
-    finally:
-        if task is not None:
-            task.close()
-
-
-@contextlib.contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Processes started within get one thread a linear algebra call.
-
-    Workers share the cores already, and threads that wait for each other on a busy core make a
-    matrix product of this size forty times slower.
-    """
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
 class TaskVecEnv(VecEnv):
-    """``num_envs`` robots of a task, spread over ``workers`` processes.
+    """``num_envs`` robots of a task, spread over ``workers`` workers.
 
     Robots whose episode ended are reset within ``step``; ``infos`` holds their last observation
     and whether they were truncated, as SB3 expects.
@@ -281,7 +70,7 @@ class TaskVecEnv(VecEnv):
     Args:
         make_task: picklable, called in each worker as ``make_task(robots, seed)``.
         num_envs: robots altogether.
-        workers: processes; the robots are shared out evenly.
+        workers: their number; the robots are shared out evenly.
         seed: from which each worker's seed is drawn.
         spaces: observation and action space of the task.
         recover: start workers that fail anew; otherwise the first fault is raised.
@@ -314,21 +103,18 @@ class TaskVecEnv(VecEnv):
         self.timeout = timeout
         self.faults: list[Fault] = []
         self._make_task, self._seed, self._recover = make_task, seed, recover
-        self._shared = _Shared(num_envs, spaces[0].shape[0], spaces[1].shape[0])
-        self._views = self._shared.arrays()
+        self._arrays = Arrays(num_envs, spaces[0].shape[0], spaces[1].shape[0])
+        self._views = self._arrays.views()
         bounds = np.linspace(0, num_envs, workers + 1).astype(int).tolist()
         self._rows = [slice(*ends) for ends in itertools.pairwise(bounds)]
         self._restarts = [0] * workers
         self._broken: dict[int, WorkerError] = {}  # workers that failed and were not mended yet
         self._steps = 0
         self._fault_steps = deque([-FAULT_STEPS] * FAULTS, maxlen=FAULTS)  # the last faults' steps
-        self._pipes: list[Connection] = []
-        self._processes: list[Any] = []
+        self._links: list[Link] = []
         atexit.register(self.close)  # or the interpreter would wait for the workers at its end
         for k in range(workers):
-            pipe, process = self._start(k)
-            self._pipes.append(pipe)
-            self._processes.append(process)
+            self._links.append(self._start(k))
         # The last known ones; a worker begins by telling its own.
         states = [self._receive(k, _START_SECONDS) for k in range(workers)]
         if self._broken:
@@ -340,56 +126,34 @@ class TaskVecEnv(VecEnv):
 
     # ------------------------------------------------------------------ the workers
 
-    def _start(self, worker: int, state: State | None = None) -> tuple[Connection, Any]:
-        context = mp.get_context("spawn")
-        ours, theirs = context.Pipe()
+    def _start(self, worker: int, state: State | None = None) -> Link:
         seed = worker_seed(self._seed, worker, self._restarts[worker])
-        process = context.Process(
-            target=_work,
-            args=(theirs, self._make_task, self._rows[worker], seed, self._shared, state),
-            daemon=True,
-            name=f"tdgc-worker-{worker}",
-        )
-        with one_blas_thread():
-            process.start()
-        theirs.close()
-        return ours, process
+        return ProcessLink(worker, self._make_task, self._arrays, self._rows[worker], seed, state)
 
     def _replace(self, worker: int, restarts: int, state: State | None = None) -> None:
-        """Put a new process in a worker's place; it has to be waited for."""
-        self._processes[worker].kill()
-        self._processes[worker].join()
-        self._pipes[worker].close()
+        """Put a new worker in another one's place; it has to be waited for."""
+        self._links[worker].end(0.0)
         self._broken.pop(worker, None)
         self._restarts[worker] = restarts
-        self._pipes[worker], self._processes[worker] = self._start(worker, state)
+        self._links[worker] = self._start(worker, state)
 
     @property
     def worker_pids(self) -> list[int]:
         """Process numbers of the workers."""
-        return [process.pid for process in self._processes]
+        return [link.pid for link in self._links]
 
-    def _send(self, worker: int, word: str, argument: Any = None) -> None:
-        with contextlib.suppress(OSError):  # that it is gone is seen when its answer is wanted
-            self._pipes[worker].send((word, argument))
+    def _send(self, word: str) -> None:
+        for link in self._links:
+            link.send(word)
 
     def _receive(self, worker: int, timeout: float) -> Any:
         """A worker's answer; or the ``WorkerError``, which stays until the worker is replaced."""
-        if worker in self._broken:
-            return self._broken[worker]
-        try:
-            if not self._pipes[worker].poll(timeout):
-                fault = WorkerError(f"worker {worker} gave no answer for {timeout:g} s")
-            elif isinstance(answer := self._pipes[worker].recv(), WorkerError):
-                fault = WorkerError(f"worker {worker} failed:\n{answer}")
-            else:
-                return answer
-        except (EOFError, OSError):
-            process = self._processes[worker]
-            process.join(timeout=5.0)  # its pipe closes a moment before it ends
-            fault = WorkerError(f"worker {worker} died (exit code {process.exitcode})")
-        self._broken[worker] = fault
-        return fault
+        if worker not in self._broken:
+            try:
+                return self._links[worker].receive(timeout)
+            except WorkerError as error:
+                self._broken[worker] = error
+        return self._broken[worker]
 
     def _receive_all(self) -> list[Any]:
         """Every worker's answer, or its ``WorkerError``.
@@ -397,14 +161,13 @@ class TaskVecEnv(VecEnv):
         Raises:
             WorkerError: one failed, and no worker is to be started anew.
         """
-        answers = [self._receive(k, self.timeout) for k in range(len(self._pipes))]
+        answers = [self._receive(k, self.timeout) for k in range(len(self._links))]
         if self._broken and not self._recover:
             raise self._broken[min(self._broken)]
         return answers
 
     def _ask(self, word: str) -> list[Any]:
-        for k in range(len(self._pipes)):
-            self._send(k, word)
+        self._send(word)
         return self._receive_all()
 
     def _mend(self) -> NDArray[np.bool_]:
@@ -456,8 +219,7 @@ class TaskVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
         self._views["actions"][:] = actions
-        for k in range(len(self._pipes)):
-            self._send(k, "step")
+        self._send("step")
 
     def step_wait(self) -> Any:
         self._receive_all()
@@ -515,8 +277,8 @@ class TaskVecEnv(VecEnv):
             ValueError: states of another number of workers or robots.
             WorkerError: a worker failed.
         """
-        if len(states) != len(self._pipes):
-            raise ValueError(f"states of {len(states)} workers do not fit {len(self._pipes)}")
+        if len(states) != len(self._links):
+            raise ValueError(f"states of {len(states)} workers do not fit {len(self._links)}")
         for rows, state in zip(self._rows, states, strict=True):
             robots = rows.stop - rows.start
             returns = state.get("returns", np.zeros(robots))
@@ -529,7 +291,7 @@ class TaskVecEnv(VecEnv):
             if restarts != self._restarts[k]:  # its seed is another one
                 self._replace(k, restarts)
                 self._receive(k, _START_SECONDS)
-            self._send(k, "load", state)
+            self._links[k].send("load", state)
         self._receive_all()
         if self._broken:
             raise self._broken[min(self._broken)]
@@ -538,15 +300,9 @@ class TaskVecEnv(VecEnv):
     def close(self) -> None:
         """Stop the workers, gently and then not."""
         atexit.unregister(self.close)
-        for k in range(len(self._pipes)):
-            self._send(k, "close")
-        for k, process in enumerate(self._processes):
-            process.join(timeout=0.0 if k in self._broken else 5.0)
-            if process.is_alive():
-                process.kill()
-                process.join()
-        for pipe in self._pipes:
-            pipe.close()
+        self._send("close")
+        for k, link in enumerate(self._links):
+            link.end(timeout=0.0 if k in self._broken else 5.0)
 
     # What SB3 asks of every VecEnv and a batched world has no single environment to answer for.
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:

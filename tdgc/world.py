@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -309,26 +310,36 @@ class World:
             offset: (M, 12) rad, error of each joint's zero.
         """
         joints, live, state = self._joints, self._active, self.state
-        robots = [(self._client_of[i], self._bodies[i]) for i in live]
-        clients = list(dict.fromkeys(client for client, _ in robots))
-        dt, control_dt = self.physics.dt, self.physics.control_dt
+        clients = list(dict.fromkeys(self._client_of[i] for i in live))
+        robots = [(self._client_of[i].id, self._bodies[i]) for i in live]
+        # At these calls, one a robot and physics step, even a client's bound functions are slow.
+        command, measure = pybullet.setJointMotorControlArray, pybullet.getJointStates
+        # Targets of each physics step: those of the control step that has taken effect by then.
+        passed = self.physics.dt * np.arange(self.physics.substeps)[:, None]
+        age = np.ceil(np.maximum(delay[live] - passed - 1e-9, 0.0) / self.physics.control_dt)
+        wanted = targets[age.astype(int), live] + offset[live]
         trunk_force = np.zeros(self.num_robots)
-        strength, offset, delay = self.strength[live], offset[live], delay[live]
+        strength = self.strength[live]
         q, qd = state.q[live], state.qd[live]
-        for k in range(self.physics.substeps):
-            age = np.ceil(np.maximum(delay - k * dt - 1e-9, 0.0) / control_dt).astype(int)
-            torque = pd_torque(targets[age, live] + offset - q, qd, strength, self.robot)
-            for (client, body), forces in zip(robots, torque.tolist(), strict=True):
-                client.setJointMotorControlArray(
-                    body, joints, pybullet.TORQUE_CONTROL, forces=forces
+        for target in wanted:
+            torque = pd_torque(target - q, qd, strength, self.robot)
+            for (client_id, body), forces in zip(robots, torque.tolist(), strict=True):
+                command(
+                    body,
+                    joints,
+                    pybullet.TORQUE_CONTROL,
+                    forces=forces,
+                    physicsClientId=client_id,
                 )
             started = time.perf_counter()
             for client in clients:
                 client.stepSimulation()
             self.bullet_seconds += time.perf_counter() - started
-            flat = [s for client, body in robots for s in client.getJointStates(body, joints)]
-            q = np.array([s[0] for s in flat]).reshape(-1, NUM_JOINTS)
-            qd = np.array([s[1] for s in flat]).reshape(-1, NUM_JOINTS)
+            flat = [s for client_id, body in robots for s in measure(body, joints, client_id)]
+            q, qd = (
+                np.fromiter(map(itemgetter(k), flat), np.float64, len(flat)).reshape(q.shape)
+                for k in (0, 1)
+            )
             force = np.zeros(self.num_robots)
             for client in clients:
                 for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=-1):
@@ -336,9 +347,12 @@ class World:
             np.maximum(trunk_force, force, out=trunk_force)
         state.q[live], state.qd[live], state.torque[live] = q, qd, torque
         state.trunk_force = trunk_force
-        for i, (client, body) in zip(live, robots, strict=True):
-            state.position[i], state.quaternion[i] = client.getBasePositionAndOrientation(body)
-            state.lin_vel[i], state.ang_vel[i] = client.getBaseVelocity(body)
+        poses = [pybullet.getBasePositionAndOrientation(body, i) for i, body in robots]
+        speeds = [pybullet.getBaseVelocity(body, i) for i, body in robots]
+        state.position[live] = np.reshape([position for position, _ in poses], (-1, 3))
+        state.quaternion[live] = np.reshape([quaternion for _, quaternion in poses], (-1, 4))
+        state.lin_vel[live] = np.reshape([linear for linear, _ in speeds], (-1, 3))
+        state.ang_vel[live] = np.reshape([angular for _, angular in speeds], (-1, 3))
         state.derive()
         self._read_contacts()
 

@@ -62,6 +62,13 @@ def test_encode_finds_the_action_in_the_middle(gait: int) -> None:
     np.testing.assert_allclose(decoder.decode(action), command, atol=1e-12)
 
 
+def test_encode_takes_batches() -> None:
+    decoder = CommandDecoder()
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, 13))
+    actions[..., -1] = [-0.75, 0.25, 0.75]  # the middles of trot, pace, bound
+    np.testing.assert_allclose(decoder.encode(decoder.decode(actions)), actions)
+
+
 def test_encode_refuses_what_no_action_gives() -> None:
     command = default_command()
     command[INDEX["vx"]] = 1.2

@@ -23,7 +23,7 @@ from tdgc.config import (
     RandomisationConfig,
     to_dict,
 )
-from tdgc.drivers import BaselineDriver, GoToGoal, HierarchyDriver, load_high
+from tdgc.drivers import BaselineDriver, GoToGoal, HierarchyDriver, TeacherDriver, load_high
 from tdgc.high_env import PRETRAINED, SEMANTIC, NavigationTask, high_layout, load_low, observe_high
 from tdgc.locomotion import Locomotion
 from tdgc.policies import Policy
@@ -105,6 +105,33 @@ def test_baseline_holds_the_default_behaviour_parameters(low):
 # ------------------------------------------------------------------ tdgc
 
 
+def test_the_teacher_drives_as_it_teaches(low):
+    """Its commands are those that the apprentice is shown, held for a decision."""
+    policy, _ = low
+    task = NavigationTask(
+        HighLevelConfig(families=("gap", "stair")), LOW, 2, seed=4, training=False, guided=1
+    )
+    try:
+        task.reset(np.arange(2))
+        loco = task.locomotion
+        drivers = {}
+        for family in ("gap", "stair"):
+            driver = TeacherDriver()
+            driver.begin(loco, task.goal, family)
+            drivers[family] = driver
+        for step in range(12):
+            if step % 5 == 0:
+                taught = task.decoder.decode(task.observe()[:, -NUM_ACTIONS:].astype(float))
+            commands = {family: d.command(step).copy() for family, d in drivers.items()}
+            np.testing.assert_allclose(commands["gap"][0], taught[0], atol=1e-6)
+            np.testing.assert_allclose(commands["stair"][1], taught[1], atol=1e-6)
+            loco.command[:] = taught
+            loco.act(policy.predict(loco.observe())[0])
+        assert taught[0, 12:].tolist() == [0.0, 0.0, 0.0]  # pronk
+    finally:
+        task.close()
+
+
 def test_hierarchy_decides_in_the_evaluation_as_in_its_environment(low, tmp_path):
     """Observation, LSTM state, last action and clock of the environment, decision by decision."""
     config = dataclasses.replace(CONFIG, families=("gap",))
@@ -184,6 +211,11 @@ def test_a_low_level_that_does_not_match_is_refused_by_name(low, tmp_path):
     slow = dataclasses.replace(config, physics=PhysicsConfig(control_dt=0.04))
     with pytest.raises(ConfigError, match=r"high: .* a control step of 0.02 s, not 0.04$"):
         load_high(path, policy, slow)
+    fixed = dataclasses.replace(
+        config, robot=dataclasses.replace(config.robot, commanded_pose=False)
+    )
+    with pytest.raises(ConfigError, match=r"with robot.commanded_pose True, not False$"):
+        load_high(path, policy, fixed)
     narrow = dataclasses.replace(
         config, commands=dataclasses.replace(CommandRanges(), vy=(-0.3, 0.3))
     )

@@ -296,7 +296,11 @@ def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, cap
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--policies", "wtw"], "unknown policy 'wtw'; allowed: all, tdgc, gp"),
+        (["--policies", "wtw"], "unknown policy 'wtw'; allowed: all, tdgc, gp, teacher"),
+        (
+            ["--policies", "gp,teacher", "--conditions", "nominal,mixed"],
+            "the teacher knows rough, pillar, stair, gap, tilt; it cannot lead on mixed",
+        ),
         (["--families", "gap,gap"], "family 'gap' is named twice"),
         (["--levels", "6-8,7"], "--levels '6-8,7' names a level twice"),
         (["--levels", "13"], "--levels '13' must name levels from 0 to 12"),

@@ -19,7 +19,8 @@ from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.low_env import LowLevelTask
 from tdgc.robot import Array
 from tdgc.state import State, join, split
-from tdgc.vec import FAULT_STEPS, Fault, TaskVecEnv, WorkerError, worker_seed
+from tdgc.vec import FAULT_STEPS, Fault, TaskVecEnv, worker_seed
+from tdgc.worker import WorkerError
 
 # What a robot's action makes of its task.
 RAISE, DIE, HANG, NAN_SEEN, NAN_EARNED, INFINITE, FAR = range(2, 9)

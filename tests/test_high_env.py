@@ -213,13 +213,38 @@ def test_robots_begin_spread_over_the_first_levels():
     task.close()
 
 
+def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
+    config = HighLevelConfig(families=("stair", "gap"), episode_seconds=0.2)
+    task = NavigationTask(config, LOW, 40, seed=2, guided=8)
+    try:
+        task.reset(np.arange(40))
+        size = sum(width for _, width in high_layout("both"))
+        assert task.actor_dim == size and task.observation_space.shape == (size + 13,)
+        led = []
+        for _ in range(8):
+            led.append(task._led.mean())
+            leads = task._led.copy()
+            taught = task.observe()[:, size:].astype(float)
+            commands = task.teacher.commands(task.locomotion, task.goal)
+            np.testing.assert_allclose(task.decoder.decode(taught), commands, atol=1e-6)
+            _, terminated, truncated = task.step(np.full((40, 13), 0.25))
+            np.testing.assert_allclose(task._actions[0][leads], taught[leads], atol=1e-6)
+            assert (task._actions[0][~leads] == 0.25).all()
+            task.reset(np.flatnonzero(terminated | truncated))
+        assert led[0] == led[1] == 1.0  # episodes of two decisions; the share is 2/3, 1/3, 0
+        assert 0.45 < led[2] < 0.9 and 0.1 < led[4] < 0.55 and led[6] == led[7] == 0.0
+    finally:
+        task.close()
+
+
+@pytest.mark.parametrize("guided", [0, 20])
 @pytest.mark.parametrize("episodes", [True, False])
-def test_the_future_follows_from_the_state(episodes):
+def test_the_future_follows_from_the_state(episodes, guided):
     """That of episodes under way after ``forget``, which then end on the way; that of new ones
     after ``restart``."""
     config = HighLevelConfig(families=("rough", "gap"), episode_seconds=0.8)
-    first = NavigationTask(config, LOW, 3, seed=1)
-    second = NavigationTask(config, LOW, 3, seed=1)
+    first = NavigationTask(config, LOW, 3, seed=1, guided=guided)
+    second = NavigationTask(config, LOW, 3, seed=1, guided=guided)
     try:
         first.reset(np.arange(3))
         rng = np.random.default_rng(0)

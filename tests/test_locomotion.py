@@ -10,7 +10,7 @@ import pytest
 
 from tdgc.commands import INDEX, observed_command
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
-from tdgc.gaits import gait_embedding
+from tdgc.gaits import gait_embedding, swing_profile
 from tdgc.locomotion import (
     ACTOR_LAYOUT,
     GYRO_LAYOUT,
@@ -19,7 +19,7 @@ from tdgc.locomotion import (
     action_mirror,
 )
 from tdgc.low_env import CRITIC_LAYOUT, LowLevelTask
-from tdgc.robot import FOOT_RADIUS, Array, nominal_pose
+from tdgc.robot import FOOT_RADIUS, Array, commanded_pose, nominal_pose
 from tdgc.terrain import TILE_SIZE, Tile, make_tile
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig(substeps=4)
@@ -168,6 +168,32 @@ def test_act_clips_and_keeps_histories(loco: Locomotion) -> None:
         expected = np.tile(NOMINAL + action * scale, (2, 1))
         np.testing.assert_allclose(loco.targets[age], expected, atol=1e-12)
     assert loco.clock.clock.tolist() == pytest.approx([0.12, 0.12])  # two steps at 3 Hz
+
+
+def test_the_pose_is_never_stale(loco: Locomotion) -> None:
+    """Whatever it follows from is changed in place or by a step: it is as derived anew."""
+
+    def fresh() -> Array:
+        return commanded_pose(ROBOT, loco.command, swing_profile(loco.clock.phases))
+
+    loco.clock.reset(np.arange(2), np.array([0.1, 0.35]))
+    seen, earlier = [], loco.state_dict()
+    for change in (
+        lambda: None,
+        lambda: loco.command.__setitem__((1, INDEX["swing_height"]), 0.2),
+        lambda: loco.command.__setitem__((0, INDEX["body_height"]), -0.03),
+        lambda: loco.clock.reset(np.array([1]), 0.6),
+        lambda: loco.act(np.zeros((2, 12))),
+        lambda: loco.load_state_dict(earlier),
+    ):
+        change()
+        error = loco.world.state.q - loco.observe()[:, ACTOR["joint_error"]]
+        np.testing.assert_allclose(error, fresh(), atol=1e-6)
+        assert (loco.pose() == fresh()).all()
+        seen.append(loco.pose().tobytes())
+    assert len(set(seen)) == 5 and seen[0] == seen[5]
+    with pytest.raises(ValueError, match="read-only"):
+        loco.pose()[0] = 0.0
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -632,13 +632,16 @@ def test_penalties_count_half_on_relief() -> None:
 
 
 def test_timing_puts_landings_at_either_side_of_a_trench() -> None:
-    """The centre of the first trench is at 2.125 m; feet land 0.20 m ahead, all on one line."""
+    """Trenches at 2.1 m and 3.35 m; feet land 0.20 m ahead, all on one line."""
 
     def frequency(x: float, clock: float, length: float = 0.345) -> float:
         one = np.ones(1)
-        return float(straddling_frequency(x * one, one, clock * one, 0.4 * one, length * one)[0])
+        timed = straddling_frequency(
+            x * one, one, clock * one, 0.4 * one, length * one, np.array([[2.1, 3.35]])
+        )
+        return float(timed[0])
 
-    on_time = 2.125 - 0.2 - 0.2  # the trunk when the feet land half a stride before the centre
+    on_time = 2.1 - 0.2 - 0.2  # the trunk when the feet land half a stride before the centre
     assert frequency(on_time, 0.0) == pytest.approx(2.5)
     assert frequency(on_time + 0.1, 0.25) == pytest.approx(2.5)  # a quarter of a cycle later
     assert frequency(on_time + 0.4, 0.0) == pytest.approx(2.5)  # the landing behind it
@@ -650,17 +653,20 @@ def test_timing_puts_landings_at_either_side_of_a_trench() -> None:
     assert frequency(on_time - 0.01, 0.0, 0.325) == pytest.approx(2.5)
 
 
-def test_half_of_the_crossings_of_trenches_leap() -> None:
+def test_most_crossings_of_trenches_leap() -> None:
     task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 400)
     pronks = (gait_index(task.locomotion.command) == 1) & task._crossing
     gap = task.column == 0
     leaps = task._stride > 0.0
     assert (leaps == (pronks & gap)).all()
-    assert 0.4 < leaps[gap & task._crossing].mean() < 0.6
+    assert 0.75 < leaps[gap & task._crossing].mean() < 0.95
     assert (task._facing[leaps] == 0.0).all()
-    stride, length = task._stride[leaps], task.locomotion.command[leaps, INDEX["stance_length"]]
-    np.testing.assert_allclose(length, np.maximum(stride - 0.055, 0.33))
-    speed = np.hypot(*task.locomotion.command[leaps, :2].T)
+    stride, command = task._stride[leaps], task.locomotion.command[leaps]
+    assert 0.35 <= stride.min() and stride.max() <= 0.39
+    np.testing.assert_allclose(command[:, INDEX["stance_length"]], np.maximum(stride - 0.055, 0.33))
+    # From rest they are timed for 1 m/s: 2.7 Hz, and up to 75 in 100 more or less by the clock.
+    assert 0.55 < (command[:, INDEX["frequency"]] > 2.0).mean() < 0.8
+    speed = np.hypot(*command[:, :2].T)
     assert speed.min() > 0.5 and speed.max() <= 1.0 + 1e-9
     task.close()
 

@@ -134,3 +134,17 @@ def test_training_figure_skips_what_a_phase_does_not_log(tmp_path: Path) -> None
     log.write_text(f"{json.dumps(plane)}\n{json.dumps(tiles)}\n", encoding="utf-8")
     plots.training_curve(log, tmp_path / "training.png")
     assert matplotlib.image.imread(tmp_path / "training.png").shape[2] == 4
+
+
+def test_decision_figure_marks_the_end_of_imitation(tmp_path: Path) -> None:
+    """In a colour that nothing else has: a dotted grey line in each of the four panels."""
+    taught = {"steps": 100_000, "reward/total": 0.1, "level/gap": 1.0, "success/gap": 0.2}
+    own = {"steps": 300_000, "reward/total": 0.2, "level/gap": 2.0, "success/gap": 0.4}
+
+    def grey(first: dict[str, float]) -> float:
+        log = tmp_path / "log.jsonl"
+        log.write_text(f"{json.dumps(first)}\n{json.dumps(own)}\n", encoding="utf-8")
+        plots.decision_curve(log, tmp_path / "training.png")
+        return share_of(picture(tmp_path / "training.png"), "#808080")
+
+    assert grey({**taught, "train/imitation_loss": 1.0}) > grey(taught) + 2e-4

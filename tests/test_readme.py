@@ -42,6 +42,9 @@ COMMANDS: dict[str, str | None] = {
         "--out {tmp}/evaluation"
     ),
     "python evaluate.py --tracking": "--episodes 1 --workers 1 --out {tmp}/tracking",
+    "python evaluate.py --policies teacher --families stair,gap --episodes 20": (
+        "--families gap --levels 6 --episodes 1 --workers 1 --out {tmp}/teacher"
+    ),
     "python evaluate.py --trace failed": (
         "--policies gp --levels 10 --families gap --episodes 1 --workers 1 --out {tmp}/trace"
     ),
@@ -70,6 +73,7 @@ OUTPUTS = (
     "evaluation/summary.json",
     "evaluation/success.png",
     "tracking/tracking.json",
+    "teacher/summary.json",
     "trace/diagnosis.csv",
     "trace/traces/gp_nominal_gap_10_000.parquet",
     "tune/tuning.json",

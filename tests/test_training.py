@@ -1,5 +1,6 @@
 """Checkpoints, interruption, and a resumed run that ends as if it had never stopped."""
 
+import argparse
 import contextlib
 import dataclasses
 import json
@@ -25,12 +26,15 @@ import train_high
 import train_low
 from tdgc import policies
 from tdgc.config import LowTrainConfig, PPOConfig, from_dict, with_overrides
+from tdgc.cores import usable_cores
 from tdgc.low_env import LowLevelTask
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.training import (
     CheckpointError,
     Interruption,
+    add_arguments,
     append_line,
+    configure,
     load_learner,
     newest_checkpoint,
     read_checkpoint,
@@ -372,13 +376,15 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
 def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Five updates of the recurrent learner, which remembers the episodes under way. The second run
-    has a checkpoint after each and is killed in the middle of the fourth's rollout."""
+    """Five updates of the recurrent learner, which remembers the episodes under way: two of
+    imitation and three of reinforcement learning. The second run has a checkpoint after each, is
+    stopped after the first and killed in the middle of the fourth's rollout."""
     arguments = [
         "--seed", "3", "--n-envs", "2", "--workers", "1", "--steps", "40",
         "--set", "checkpoint_seconds=0", "--set", "log_steps=16", "--set", "ppo.n_steps=4",
         "--set", "ppo.minibatches=2", "--set", "ppo.n_epochs=2", "--set", "ppo.lstm=8",
         "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.7",
+        "--set", "imitation.steps=16",
     ]  # fmt: skip
     monkeypatch.chdir(ROOT)  # the shipped low level is named from there
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -387,7 +393,12 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     )
     assert [row["steps"] for row in rows(whole)] == [16, 32]
     last = broken / "checkpoints/step-000000000024"
-    kill_run("train_high.py", [*arguments, "--out", str(broken)], last, after=0.05)
+    with monkeypatch.context() as patch:
+        at_calls(patch, lambda call, run: setattr(run, "reason", "a test" if call == 2 else None))
+        assert train_high.main([*arguments, "--out", str(broken)]) == 0
+    stopped = read_checkpoint(newest(broken))[1]
+    assert stopped["num_timesteps"] == 8 and stopped["phase"] == 0
+    kill_run("train_high.py", ["--resume", "--out", str(broken)], last, after=0.05)
     tensors, header = read_checkpoint(newest(broken))
     assert header["num_timesteps"] < 40
     (state,) = workers_of(tensors, header)
@@ -507,6 +518,24 @@ def test_flags_and_folders_that_cannot_be_used(
         assert error.startswith("train_low.py: ") and message in error
         assert error.count("\n") == 1
     assert not empty.exists()
+
+
+def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as there are cores and robots for them; a run goes on with as many as it began."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser, str(tmp_path))
+
+    def workers(*flags: str) -> int:
+        return configure(LowTrainConfig(), parser.parse_args(flags)).workers
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(3)))
+    monkeypatch.setattr("tdgc.training.usable_cores", lambda: usable_cores(tmp_path))
+    assert workers() == workers("--set", "workers=2") == 2
+    assert workers("--workers", "auto") == 3
+    assert workers("--workers", "auto", "--n-envs", "25") == 2
+    (tmp_path / "config.json").write_text('{"workers": 7}', encoding="utf-8")
+    assert workers("--resume", "--workers", "auto") == workers("--resume") == 7
+    assert workers("--resume", "--workers", "5") == 5
 
 
 def test_phases_of_a_run() -> None:

@@ -4,7 +4,10 @@ import functools
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +18,8 @@ from tdgc.config import LowLevelConfig, PhysicsConfig
 from tdgc.low_env import LowLevelTask
 from tdgc.robot import Array
 from tdgc.state import State, split
-from tdgc.vec import TaskVecEnv, WorkerError, worker_seed
+from tdgc.vec import TaskVecEnv, worker_seed
+from tdgc.worker import WorkerError
 
 CONFIG = LowLevelConfig(episode_seconds=0.5, physics=PhysicsConfig(substeps=4))
 
@@ -237,6 +241,37 @@ def test_statistics_and_states_of_each_worker(counters: TaskVecEnv) -> None:
         counters.load_state_dicts(states[::-1])
 
 
+SCRIPT = """
+import functools
+from pathlib import Path
+import torch
+from tdgc.config import LowLevelConfig
+from tdgc.low_env import LowLevelTask
+from tdgc.vec import TaskVecEnv
+
+class Own(LowLevelTask):
+    pass
+
+if __name__ == "__main__":
+    probe = LowLevelTask(LowLevelConfig(), 1, 0)
+    spaces = probe.observation_space, probe.action_space
+    for task in (LowLevelTask, Own):
+        env = TaskVecEnv(functools.partial(task, LowLevelConfig()), 1, 1, 0, spaces)
+        print("libtorch" in Path(f"/proc/{env.worker_pids[0]}/maps").read_text())
+        env.close()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_workers_have_no_torch(tmp_path: Path) -> None:
+    """The low level's have none, nor do they import the script, unless the task is from there."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    result = subprocess.run([sys.executable, script], env=environment, capture_output=True)
+    assert result.stdout.split()[-2:] == [b"False", b"True"], result.stderr.decode()
+
+
 def test_what_a_batched_world_cannot_answer(counters: TaskVecEnv) -> None:
     assert counters.num_envs == 5
     assert counters.get_attr("num_envs", [0, 3]) == [5, 5]
@@ -252,7 +287,7 @@ def test_a_terminals_interrupt_is_the_parents_to_answer(counters: TaskVecEnv) ->
         os.kill(pid, signal.SIGINT)
         os.kill(pid, signal.SIGTERM)
     assert counters.reset().shape == (5, 3)
-    assert all(process.is_alive() for process in counters._processes)
+    assert set(counters.worker_pids) <= {p.pid for p in multiprocessing.active_children()}
 
 
 @pytest.mark.parametrize("workers", [0, 4, -1])
@@ -285,17 +320,15 @@ def test_workers_that_raise_or_are_killed_are_named_and_close_leaves_none() -> N
     message = str(caught.value)
     assert message.startswith("worker 1 failed:\nTraceback (most recent call last):")
     assert "ValueError: the ground is gone" in message and "in step" in message
-    victim = env._processes[0]
-    assert victim.pid is not None
-    os.kill(victim.pid, signal.SIGKILL)
+    os.kill(env.worker_pids[0], signal.SIGKILL)
     for _ in range(2):
         with pytest.raises(WorkerError, match=r"^worker 0 died \(exit code -9\)$"):
             env.step(actions)
     with pytest.raises(WorkerError, match=r"^worker 0 died \(exit code -9\)$"):
         env.state_dicts()
-    processes = env._processes
+    pids = set(env.worker_pids)
     env.close()
-    assert not any(process.is_alive() for process in processes)
+    assert not pids & {process.pid for process in multiprocessing.active_children()}
     env.close()  # once more does no harm
 
 

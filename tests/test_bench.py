@@ -1,0 +1,60 @@
+"""What the benchmark of the simulation measures and writes; not how fast it is."""
+
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+
+from tdgc import bench
+from tdgc.config import LowLevelConfig, LowTrainConfig
+from tdgc.low_env import LowLevelTask
+from tdgc.vec import TaskVecEnv
+
+
+def test_robots_are_spread_over_the_levels() -> None:
+    """Five robots in two workers, of which each spreads its own; all begin new episodes."""
+    config = LowLevelConfig()
+    probe = LowLevelTask(config, 1, 0)
+    spaces = probe.observation_space, probe.action_space
+    probe.close()
+    env = TaskVecEnv(functools.partial(LowLevelTask, config), 5, 2, 0, spaces)
+    env.reset()
+    env.step(np.zeros((5, 12), dtype=np.float32))
+    bench.spread_levels(env, 2)
+    assert [state["level"].tolist() for state in env.state_dicts()] == [[0, 1], [0, 1, 0]]
+    assert env.starts().all()
+    env.close()
+
+
+def test_learning_leaves_the_threads_as_they_were() -> None:
+    before = th.get_num_threads()
+    assert bench.learn(LowTrainConfig(), before + 1, 0.01) > 0.0
+    assert th.get_num_threads() == before
+
+
+def test_load(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, values in (("ROBOTS", (2,)), ("WORKERS", (1, 2)), ("THREADS", (1,))):
+        monkeypatch.setattr(bench, f"LOAD_{name}", values)
+    assert bench.main(["--load", "--seconds", "0.1", "--out", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "load.json").read_text())
+    assert result["cores"] >= 1 and result["learn"]["1"] > 0.0
+    for row in result["collect"]["2"].values():
+        assert 0.0 < row["bullet_share"] < 1.0 < row["steps_per_s"]
+        assert row["mb_total"] == pytest.approx(2 * row["mb_per_robot"])
+    alone, both = (result["collect"]["2"][workers]["mb_total"] for workers in ("1", "2"))
+    assert both - alone < 100.0  # a worker with PyTorch would take 150 MB more
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines if line] == [
+        ["robots", "workers"], ["2", "1"], ["2", "2"], ["threads", "steps/s"],
+        ["1", f"{result['learn']['1']:.0f}"],
+    ]  # fmt: skip
+
+
+def test_more_workers_than_robots(capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.main(["--robots", "2", "--workers", "3"]) == 2
+    assert capsys.readouterr().err == ("tdgc.bench: --workers must be 1 to the number of robots\n")
