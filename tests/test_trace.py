@@ -130,7 +130,8 @@ def test_commands_at_their_bounds_are_marked(low):
 
     _, (t,), _ = watch(Extreme(), Cell("gp", "nominal", "rough", 0, 0, 1), low[0])
     marked = {name: set(t[f"at_bound_{name}"][:-1].tolist()) for name in CONTINUOUS}
-    ends = {"vx": {1.0}, "vy": {-1.0}, "power_weight": {-1.0}}  # the last is 0 by default
+    # The last two are so by default: feet as high as they go, power for nothing.
+    ends = {"vx": {1.0}, "vy": {-1.0}, "swing_height": {1.0}, "power_weight": {-1.0}}
     assert {name: marked.pop(name) for name in ends} == ends
     del marked["yaw_rate"]  # whatever the goal asks
     assert set().union(*marked.values()) == {0.0}
@@ -222,7 +223,8 @@ def test_the_baseline_has_no_actions_and_no_cues(low):
         assert set(t["family"]) == {None}
         assert set(t["gait"][:-1]) == {"trot"}
         assert t["command_vx"][0] == pytest.approx(notes.seen[1]["command"][k, 0])
-        assert np.array_equal(t["at_bound_swing_height"][:-1], np.zeros(11))
+        assert np.array_equal(t["at_bound_swing_height"][:-1], np.ones(11))
+        assert np.array_equal(t["at_bound_frequency"][:-1], np.zeros(11))
 
 
 def test_robots_that_end_early_have_short_traces(low):
