@@ -23,7 +23,7 @@ from tdgc.high_env import SEMANTIC, check_pair, high_layout, observe_high
 from tdgc.locomotion import Locomotion
 from tdgc.policies import Policy
 from tdgc.robot import Array, wrap_angle
-from tdgc.teacher import Teacher
+from tdgc.teacher import Teacher, toward
 
 
 class Driver(Protocol):
@@ -64,9 +64,8 @@ class GoToGoal:
         """Forward speed and yaw rate: positions (M, 2), headings (M,), goals (M, 2)."""
         offset = goal - position
         error = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - yaw)
-        speed = np.minimum(self.top_speed, self.distance_gain * np.linalg.norm(offset, axis=1))
-        turn = np.clip(self.heading_gain * error, *CommandRanges().yaw_rate)
-        return speed * np.maximum(np.cos(error), 0.0), turn
+        distance = np.linalg.norm(offset, axis=1)
+        return toward(distance, error, self.top_speed, self.distance_gain, self.heading_gain)
 
 
 class BaselineDriver:

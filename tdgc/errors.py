@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 
+def install_hint(extra: str) -> str:
+    """What to do where the packages of an optional extra are missing."""
+    return f"install the extra '{extra}', pip install -c constraints.txt -e '.[{extra}]'"
+
+
 class InputError(ValueError):
     """Something that was read and cannot be used.
 

@@ -48,6 +48,7 @@ from tdgc.commands import (
 )
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
 from tdgc.drivers import load_high
+from tdgc.errors import install_hint
 from tdgc.gaits import FEET, GAIT_TABLE, GAITS
 from tdgc.high_env import (
     GOAL_SCALE,
@@ -655,8 +656,8 @@ def _choose_formats(text: str) -> list[str]:
     missing = [name for name in _ONNX_PACKAGES if importlib.util.find_spec(name) is None]
     if "onnx" in names and missing:
         raise ValueError(
-            f"format onnx needs {', '.join(missing)}: install the extra 'export', "
-            "pip install -c constraints.txt -e '.[export]', or use --format torchscript"
+            f"format onnx needs {', '.join(missing)}: {install_hint('export')}, "
+            "or use --format torchscript"
         )
     return names
 

@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from tdgc.commands import CONTINUOUS, UNITS, gait_index
 from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.errors import install_hint
 from tdgc.evaluation import spread, tile_of
 from tdgc.gaits import FEET, GAITS
 from tdgc.low_env import GOAL_RADIUS
@@ -68,10 +69,7 @@ def check_installed() -> None:
         FilmError: it is not installed; the message says what to install.
     """
     if importlib.util.find_spec("av") is None:
-        raise FilmError(
-            "MP4 needs PyAV: install the extra 'video', pip install -c constraints.txt "
-            "-e '.[video]'"
-        )
+        raise FilmError(f"MP4 needs PyAV: {install_hint('video')}")
 
 
 # ---------------------------------------------------------------------------- the stage

@@ -46,8 +46,6 @@ STYLES = {
 }
 _STRIDE = 0.37  # m, between leaps: at 0.35 no robot crossed the 30 cm of level 10, at 0.37 most do
 _BEYOND = 0.5  # m behind the last trench, where leaping ends
-_HEADING_GAIN = 1.5  # 1/s
-_DISTANCE_GAIN = 1.0  # 1/s, as in ``GoToGoal``
 
 # The way around pillars follows a field of travel costs on every second sample of the tile.
 _COARSE = 2
@@ -56,6 +54,27 @@ _WIDE = 0.55  # m from a pillar, where it ceases to cost
 _BLOCKED, _CLOSE = 30.0, 3.0  # cost of a metre inside the radius and at it; 1 in the open
 _LOOK = 0.35  # m ahead, where the robot looks for the lower cost
 _RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)
+
+
+def toward(
+    distance: Array,
+    error: Array,
+    top_speed: Array | float,
+    distance_gain: float = 1.0,
+    heading_gain: float = 1.5,
+) -> tuple[Array, Array]:
+    """Forward speed in m/s and yaw rate in rad/s towards a point, (M,) each.
+
+    As fast as the distance asks, turning by the heading error, and slower while facing away.
+
+    Args:
+        distance, error: (M,) m and rad, of the point's bearing against the heading.
+        top_speed: (M,) or one for all, m/s.
+        distance_gain, heading_gain: 1/s.
+    """
+    speed = np.minimum(top_speed, distance_gain * distance)
+    turn = np.clip(heading_gain * error, *CommandRanges().yaw_rate)
+    return speed * np.maximum(np.cos(error), 0.0), turn
 
 
 def trenches(heights: NDArray[np.floating]) -> Array:
@@ -158,9 +177,8 @@ class Teacher:
                 bearing[i] = _downhill(field, local[i], bearing[i])
         error = wrap_angle(bearing - state.yaw)
         command = self._command.copy()
-        speed = np.minimum(self._speed, _DISTANCE_GAIN * distance) * np.maximum(np.cos(error), 0.0)
-        command[:, INDEX["vx"]] = speed
-        command[:, INDEX["yaw_rate"]] = np.clip(_HEADING_GAIN * error, *CommandRanges().yaw_rate)
+        speed, turn = toward(distance, error, self._speed)
+        command[:, INDEX["vx"]], command[:, INDEX["yaw_rate"]] = speed, turn
         leaping = self._leaps & (local[:, 0] < self._centres.max(axis=1) + _BEYOND)
         command[:, 12:] = gait_embedding(np.where(leaping, self._gait, 0))
         rows = np.flatnonzero(leaping)

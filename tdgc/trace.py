@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tdgc import rewards
 from tdgc.commands import CONTINUOUS, INDEX, NAMES, NUM_ACTIONS, UNITS, CommandDecoder, gait_index
 from tdgc.drivers import Driver
-from tdgc.errors import InputError
+from tdgc.errors import InputError, install_hint
 from tdgc.evaluation import OUTCOMES, Cell, joint_power
 from tdgc.gaits import FEET, GAITS
 from tdgc.high_env import PROBES, SEMANTIC, command_share, height_probes, high_step
@@ -333,10 +333,7 @@ def check_installed() -> None:
         TraceError: it is not installed; the message says what to install.
     """
     if importlib.util.find_spec("pyarrow") is None:
-        raise TraceError(
-            "traces need pyarrow: install the extra 'trace', "
-            "pip install -c constraints.txt -e '.[trace]'"
-        )
+        raise TraceError(f"traces need pyarrow: {install_hint('trace')}")
 
 
 def _fields() -> list[tuple[str, Any, dict[str, str]]]:
