@@ -2,11 +2,13 @@
 
     python -m tdgc.bench --out runs/bench
     python -m tdgc.bench --load
+    python -m tdgc.bench --update
 
 Robots take random actions in the low level's MDP, on a plane and on all levels of all families,
 with one worker and with all. Writes ``bench.json`` and prints a table. With ``--load`` there are
 10, 100 and 1000 robots on the plane, with 1 to 8 workers, and then the learner alone, with 1 to
-16 threads; the table is in ``load.json``.
+16 threads; the table is in ``load.json``. With ``--update`` the high level's learner updates its
+networks by sb3-contrib's own pass and by the fast one; ``update.json``.
 """
 
 from __future__ import annotations
@@ -19,21 +21,29 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
+import gymnasium as gym
 import numpy as np
 import torch as th
+from sb3_contrib import RecurrentPPO
+from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
+from stable_baselines3.common.logger import Logger
 
-from tdgc.config import LowLevelConfig, LowTrainConfig
+from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
 from tdgc.cores import auto_workers, usable_cores, workers_flag
+from tdgc.high_env import NavigationTask
 from tdgc.low_env import LowLevelTask
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
+from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.vec import TaskVecEnv
 
 _COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
 #: What ``--load`` compares.
 LOAD_ROBOTS, LOAD_WORKERS, LOAD_THREADS = (10, 100, 1000), (1, 2, 4, 8), (1, 2, 4, 8, 16)
 _SETTLE_STEPS = 20  # not timed: robots drop onto their feet
+_EPISODE = 100  # decisions, about the mean of the shipped high level's training
 
 
 def spread_levels(env: TaskVecEnv, levels: int) -> None:
@@ -134,6 +144,68 @@ def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
     return updates * ppo.batch_size / (elapsed * ppo.n_epochs)
 
 
+def update_seconds(
+    config: HighTrainConfig, spaces: tuple[gym.spaces.Box, gym.spaces.Box], updates: int
+) -> dict[str, float]:
+    """Seconds of the high level's update after one rollout: of sb3-contrib's own, ``stock``, and of
+    ``FastRecurrentPPO``, ``fast``; the median of ``updates``, in turn.
+
+    The rollout is noise in which episodes start anywhere, one in ``_EPISODE`` decisions.
+    """
+    ppo, envs = config.ppo, config.n_envs
+    learners: dict[str, RecurrentPPO] = {}
+    for name, learner, policy in (
+        ("stock", RecurrentPPO, "MlpLstmPolicy"),
+        ("fast", FastRecurrentPPO, FastRecurrentPolicy),
+    ):
+        model = learner(
+            policy,
+            None,  # type: ignore[arg-type]  # SB3 loads its files without one, too
+            n_steps=ppo.n_steps,
+            batch_size=ppo.n_steps * envs // ppo.minibatches,
+            n_epochs=ppo.n_epochs,
+            policy_kwargs={
+                "lstm_hidden_size": ppo.lstm,
+                "net_arch": {"pi": list(ppo.actor), "vf": list(ppo.critic)},
+            },
+            seed=config.seed,
+            device="cpu",
+            _init_setup_model=False,
+        )
+        model.observation_space, model.action_space = spaces
+        model.n_envs = envs
+        model._setup_model()
+        model.set_logger(Logger(folder=None, output_formats=[]))
+        fill(model, np.random.default_rng(0))
+        learners[name] = model
+    taken: dict[str, list[float]] = {name: [] for name in learners}
+    for _ in range(updates + 1):  # the first one makes the optimiser's state
+        for name, model in learners.items():
+            started = time.perf_counter()
+            model.train()
+            taken[name].append(time.perf_counter() - started)
+    return {name: float(np.median(seconds[1:])) for name, seconds in taken.items()}
+
+
+def fill(model: RecurrentPPO, rng: np.random.Generator) -> None:
+    """Fill the rollout buffer with noise."""
+    buffer, envs = cast(RecurrentRolloutBuffer, model.rollout_buffer), model.n_envs
+    sizes = [cast(tuple[int], s.shape)[0] for s in (model.observation_space, model.action_space)]
+    buffer.reset()  # type: ignore[no-untyped-call]
+    state = th.zeros(1, envs, buffer.hidden_state_shape[-1])
+    for _ in range(buffer.buffer_size):
+        buffer.add(
+            rng.normal(size=(envs, sizes[0])),
+            rng.normal(size=(envs, sizes[1])),
+            rng.normal(size=envs),
+            rng.random(envs) < 1.0 / _EPISODE,
+            th.zeros(envs, 1),
+            th.full((envs,), -15.0),
+            lstm_states=RNNStates((state, state), (state, state)),
+        )
+    buffer.compute_returns_and_advantage(th.zeros(envs), np.zeros(envs))
+
+
 def head(*names: str) -> None:
     print(names[0].ljust(8) + "".join(name.rjust(11) for name in names[1:]))
 
@@ -181,6 +253,20 @@ def compare_loads(seconds: float) -> dict[str, Any]:
     return {"cores": usable_cores(), "collect": collect, "learn": learned}
 
 
+def compare_updates(updates: int) -> dict[str, float]:
+    """update.json: ``update_seconds`` on the default configuration, and their "ratio"."""
+    config = HighTrainConfig()
+    probe = NavigationTask(config.env, config.low, 1, seed=0)
+    spaces = probe.observation_space, probe.action_space
+    probe.close()
+    result = update_seconds(config, spaces, updates)
+    result["ratio"] = result["stock"] / result["fast"]
+    head("update", "seconds", "ratio")
+    for name in ("stock", "fast"):
+        print(f"{name:<8}{result[name]:>11.3f}{result['stock'] / result[name]:>11.1f}")
+    return result
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--robots", type=int, default=100)
@@ -188,7 +274,9 @@ def main(arguments: list[str] | None = None) -> int:
         "--workers", type=workers_flag, default="auto", metavar="N", help="all of them (one a core)"
     )
     parser.add_argument("--seconds", type=float, default=10.0, help="a measurement (10)")
-    parser.add_argument("--load", action="store_true", help="compare robots, workers and threads")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--load", action="store_true", help="compare robots, workers and threads")
+    what.add_argument("--update", action="store_true", help="compare the high level's updates")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     args = parser.parse_args(arguments)
     if args.workers == "auto":
@@ -198,6 +286,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     if args.load:
         name, result = "load.json", compare_loads(args.seconds)
+    elif args.update:
+        name, result = "update.json", compare_updates(updates=10)
     else:
         name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
     args.out.mkdir(parents=True, exist_ok=True)

@@ -1,14 +1,12 @@
 """RecurrentPPO with a fast update, exact (Sec. IV-B).
 
-sb3-contrib cuts a rollout where episodes start, pads the pieces to one length, and then calls each
-LSTM step by step in Python, since a state has to be zeroed where an episode starts. Every step
-drags the gradients of all weights along. Here
+sb3-contrib cuts a rollout where episodes start and pads the pieces to one length. Then it calls
+each LSTM step by step in Python, since a state has to be zeroed where an episode starts, and every
+step drags the gradients of all weights along. But an episode starts nowhere but at the beginning of
+a piece, so the states before the pieces are all there is to zero, and each LSTM is called once.
 
-- a minibatch holds whole environments, as in OpenAI Baselines' PPO2 for recurrent policies, so its
-  sequences have the rollout's length and nothing is padded,
-- what does not wait for the step before is left out of the loop over time: the gates' share of the
-  observations before it and the gradients of the weights after it are one product each,
-- the LSTMs of actor and critic go through the loop together.
+A minibatch holds whole environments, as in OpenAI Baselines' PPO2 for recurrent policies: only the
+LSTMs see padding, and only where an episode starts within the rollout.
 """
 
 from __future__ import annotations
@@ -24,69 +22,6 @@ from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.common.recurrent.type_aliases import RecurrentRolloutBufferSamples, RNNStates
 from torch import nn
-
-
-class _Recurrence(th.autograd.Function):
-    """The loop over time of N LSTMs, forwards and backwards, written out.
-
-    With x_t = W (observation) + b, the gates and states after step t are::
-
-        h', c' = keep_t h_{t-1}, keep_t c_{t-1}
-        z = x_t + U h';  i, f, o = sigmoid(z_i, z_f, z_o);  g = tanh(z_g)
-        c_t = f c' + i g;  h_t = o tanh(c_t)
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: th.Tensor, keep: th.Tensor, h: th.Tensor, c: th.Tensor, u: th.Tensor
-    ) -> th.Tensor:
-        """Outputs h_t of all steps, (N, T, B, H).
-
-        Args:
-            x: (N, T, B, 4 H), in torch's order of gates: i, f, g, o.
-            keep: (T, B, 1), 0.0 where an episode starts and 1.0 elsewhere.
-            h, c: states before the first step, (N, B, H); data, no gradient goes there.
-            u: recurrent weights, (N, 4 H, H).
-        """
-        steps = []
-        for x_t, keep_t in zip(x.unbind(1), keep, strict=True):
-            h_in, c_in = h * keep_t, c * keep_t
-            z = th.baddbmm(x_t, h_in, u.mT)
-            i, f, g, o = z.chunk(4, dim=-1)
-            g.mul_(2.0)  # tanh(a) = 2 sigmoid(2 a) - 1, and torch's tanh takes thrice as long
-            z.sigmoid_()
-            g.mul_(2.0).sub_(1.0)
-            c = (f * c_in).addcmul_(i, g)
-            tanh_c = (2.0 * c).sigmoid_().mul_(2.0).sub_(1.0)
-            h = o * tanh_c
-            steps.append((z, h_in, c_in, tanh_c, h))
-        gates, h_in, c_in, tanh_c, out = (
-            th.stack(parts, dim=1) for parts in zip(*steps, strict=True)
-        )
-        ctx.save_for_backward(gates, h_in, c_in, tanh_c, keep, u)
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, d_out: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        """Backpropagation through time: the gradients of x and u from that of the outputs."""
-        gates, h_in, c_in, tanh_c, keep, u = ctx.saved_tensors
-        i, f, g, o = gates.chunk(4, dim=-1)
-        # The derivatives of c_t by z_i, z_f, z_g and of h_t by z_o, until the loop has the factor.
-        dz = th.cat(
-            (g * (i - i * i), c_in * (f - f * f), i * (1.0 - g * g), tanh_c * (o - o * o)), -1
-        )
-        by_gate = dz.view(*h_in.shape[:3], 4, -1)
-        through_h, through_time = o - o * tanh_c * tanh_c, f * keep
-        dh, dc = d_out[:, -1], th.zeros_like(d_out[:, -1])
-        for t in reversed(range(len(keep))):
-            dc = th.addcmul(dc, dh, through_h[:, t])
-            by_gate[:, t, :, :3] *= dc.unsqueeze(-2)
-            by_gate[:, t, :, 3] *= dh
-            if t > 0:
-                dh = th.addcmul(d_out[:, t - 1], keep[t], dz[:, t] @ u)
-                dc = dc * through_time[:, t]
-        du = dz.flatten(1, 2).mT @ h_in.flatten(1, 2)
-        return dz, None, None, None, du
 
 
 class FastRecurrentPolicy(RecurrentActorCriticPolicy):
@@ -122,20 +57,26 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         Returns:
             Values (n_seq * length, 1); log probabilities and entropies (n_seq * length,).
         """
-        lstms = (self.lstm_actor, cast(nn.LSTM, self.lstm_critic))
-        w = th.stack([lstm.all_weights[0][0] for lstm in lstms])
-        u = th.stack([lstm.all_weights[0][1] for lstm in lstms])
-        # Added before they are stacked, or the two would share one gradient, to be clipped twice.
-        bias = th.stack([lstm.all_weights[0][2] + lstm.all_weights[0][3] for lstm in lstms])
-        h, c = (th.cat(pair) for pair in zip(lstm_states.pi, lstm_states.vf, strict=True))
-        n_seq, hidden = h.shape[1:]
-        features = cast(th.Tensor, self.extract_features(obs))
-        by_time = features.view(n_seq, -1, features.shape[1]).transpose(0, 1).flatten(0, 1)
-        keep = 1.0 - episode_starts.view(n_seq, -1, 1).transpose(0, 1)
-        x = th.baddbmm(bias.unsqueeze(1), by_time.expand(len(w), -1, -1), w.mT)
-        x = x.view(len(w), -1, n_seq, 4 * hidden)
-        out = _Recurrence.apply(x, keep, h, c, u)  # type: ignore[no-untyped-call]
-        latent_pi, latent_vf = out.transpose(1, 2).flatten(1, 2)
+        n_seq = lstm_states.pi[0].shape[1]
+        starts = episode_starts.view(n_seq, -1) > 0.0
+        length = starts.shape[1]
+        cuts = starts.clone()
+        cuts[:, 0] = True
+        first = cuts.flatten().nonzero().squeeze(1)  # of each piece
+        sizes = th.diff(first, append=first.new_tensor([cuts.numel()]))
+        offset = th.arange(int(sizes.max()), device=first.device)
+        inside = offset < sizes.unsqueeze(1)
+        # (longest, pieces); what pads a piece is thrown away again.
+        steps = (first + offset.unsqueeze(1)).clamp_(max=cuts.numel() - 1)
+        goes_on = ((first % length == 0) & ~starts.flatten()[first]).to(obs.dtype).view(1, -1, 1)
+        pieces = cast(th.Tensor, self.extract_features(obs))[steps]
+
+        def run(lstm: nn.LSTM, states: tuple[th.Tensor, ...]) -> th.Tensor:
+            before = tuple(state[:, first // length] * goes_on for state in states)
+            return lstm(pieces, before)[0].transpose(0, 1)[inside]
+
+        latent_pi = run(self.lstm_actor, lstm_states.pi)
+        latent_vf = run(cast(nn.LSTM, self.lstm_critic), lstm_states.vf)
         values = self.value_net(self.mlp_extractor.forward_critic(latent_vf))
         distribution = self._get_action_dist_from_latent(
             self.mlp_extractor.forward_actor(latent_pi)
@@ -144,7 +85,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
 
 
 class WholeEnvBuffer(RecurrentRolloutBuffer):
-    """Rollout buffer whose minibatches hold whole environments, so nothing is cut or padded."""
+    """Rollout buffer whose minibatches hold whole environments."""
 
     def get(  # type: ignore[override]  # as sb3-contrib has it
         self, batch_size: int | None = None

@@ -1,5 +1,6 @@
 """What the benchmark of the simulation measures and writes; not how fast it is."""
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -7,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib import RecurrentPPO
 
 from tdgc import bench
-from tdgc.config import LowLevelConfig, LowTrainConfig
+from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
 from tdgc.low_env import LowLevelTask
+from tdgc.recurrent import FastRecurrentPPO
 from tdgc.vec import TaskVecEnv
 
 
@@ -53,6 +56,31 @@ def test_load(
         ["robots", "workers"], ["2", "1"], ["2", "2"], ["threads", "steps/s"],
         ["1", f"{result['learn']['1']:.0f}"],
     ]  # fmt: skip
+
+
+def test_the_high_levels_update(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both learners on a small configuration; each of them is to have changed its parameters."""
+    config = HighTrainConfig(n_envs=4)
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, n_steps=8, lstm=8))
+    monkeypatch.setattr(bench, "HighTrainConfig", lambda: config)
+    learners, before, fill = [], [], bench.fill
+
+    def keep(model: RecurrentPPO, rng: np.random.Generator) -> None:
+        fill(model, rng)
+        learners.append(model)
+        before.append({name: p.clone() for name, p in model.policy.state_dict().items()})
+
+    monkeypatch.setattr(bench, "fill", keep)
+    assert bench.main(["--update", "--out", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "update.json").read_text())
+    assert result["ratio"] == result["stock"] / result["fast"] > 0.0
+    assert [type(model) for model in learners] == [RecurrentPPO, FastRecurrentPPO]
+    for model, start in zip(learners, before, strict=True):
+        assert all((p != start[name]).any() for name, p in model.policy.state_dict().items())
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["update", "stock", "fast"]
 
 
 def test_more_workers_than_robots(capsys: pytest.CaptureFixture[str]) -> None:

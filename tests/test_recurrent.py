@@ -9,7 +9,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
-from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO, _Recurrence
+from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 
 OBS, ACT, HIDDEN = 6, 2, 16
 ENVS, STEPS = 5, 12
@@ -78,22 +78,6 @@ def test_parameters_are_the_stock_policys():
     assert all(th.equal(a, stock.state_dict()[n]) for n, a in fast.state_dict().items())
     groups = [p.optimizer.param_groups[0] for p in (fast, stock)]
     assert groups[0]["eps"] == groups[1]["eps"] and groups[0]["lr"] == groups[1]["lr"]
-
-
-def test_backward_is_the_derivative_of_forward():
-    """Against finite differences in double precision, with starts in the first step and later."""
-    generator = th.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> th.Tensor:
-        return th.randn(*shape, generator=generator, dtype=th.float64)
-
-    n, length, n_seq, hidden = 2, 4, 3, 2
-    keep = th.ones(length, n_seq, 1, dtype=th.float64)
-    keep[0, 0] = keep[2, 1] = keep[3, 1] = 0.0
-    x, u = normal(n, length, n_seq, 4 * hidden), normal(n, 4 * hidden, hidden)
-    h, c = normal(n, n_seq, hidden), normal(n, n_seq, hidden)
-    inputs = (x.requires_grad_(), keep, h, c, u.requires_grad_())
-    assert th.autograd.gradcheck(_Recurrence.apply, inputs)
 
 
 def test_outputs_and_gradients_on_rollouts():
