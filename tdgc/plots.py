@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,6 +52,14 @@ def _save(figure: Figure, out: Path) -> None:
     finally:
         partial.unlink(missing_ok=True)
         plt.close(figure)
+
+
+def _caption(figure: Figure, text: str) -> None:
+    """A line below the panels, broken to the figure's width."""
+    letters = int(
+        14 * figure.get_size_inches()[0]
+    )  # of 9 points, half as wide as tall, and a margin
+    figure.supxlabel(textwrap.fill(text, letters), fontsize=9)
 
 
 # ---------------------------------------------------------------------------- evaluation
@@ -208,9 +217,9 @@ def headings(folder: Path, out: Path) -> None:
             axis.yaxis.set_major_locator(MaxNLocator(3, integer=True))
             axis.set_rlabel_position(135)
             axis.set_title(f"{policy}, {family}", fontsize=9)
-    figure.supxlabel(
+    _caption(
+        figure,
         "Heading of the body against its direction of travel (up); radius: share of that time (%)",
-        fontsize=9,
     )
     _save(figure, out)
 
@@ -254,10 +263,10 @@ def trajectories(folder: Path, out: Path) -> None:
     for axis in axes[-1]:
         axis.set_xlabel("x (m)")
     axes[0, 0].set(xlim=(0, TILE_SIZE), ylim=(0, TILE_SIZE))
-    figure.supxlabel(
+    _caption(
+        figure,
         "Arrows: heading of the body, once a second. Cross: end of an episode that did not reach "
         "the goal (dashed).",
-        fontsize=9,
     )
     _save(figure, out)
 

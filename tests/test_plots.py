@@ -106,6 +106,19 @@ def test_heading_figure_turns_with_the_robots(tmp_path: Path) -> None:
     assert centroids[1] - centroids[0] > 0.1
 
 
+def test_figures_of_a_single_episode_hold_their_captions(tmp_path: Path) -> None:
+    """Nothing touches the sides, where a line too long would be cut off."""
+    tile = tile_of(0, "gap", 6, 0)
+    track = straight(tile.start, np.array([0.5, 0.0]), 0.0, 9.5)
+    where = ("gp", "nominal", "gap", 6, 0, 0)
+    only = Episode(*where, "fell", 9.5, 4.7, 500.0, (1.0, 0.0, 0.0, 0.0), tile.goal, track)
+    write_results(tmp_path, [only])
+    for draw in (plots.headings, plots.trajectories):
+        draw(tmp_path, tmp_path / "figure.png")
+        pixels = picture(tmp_path / "figure.png")
+        assert (pixels[:, :2] == 1.0).all() and (pixels[:, -2:] == 1.0).all(), draw.__name__
+
+
 def test_heading_figure_of_robots_that_stand(tmp_path: Path) -> None:
     tile = tile_of(0, "gap", 6, 0)
     track = straight(tile.start, np.zeros(2), 0.0, 1.0)
