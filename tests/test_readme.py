@@ -54,6 +54,9 @@ COMMANDS: dict[str, str | None] = {
     "python evaluate.py --video --families stair,gap --levels 8": (
         "--policies gp --levels 10 --families gap --episodes 1 --workers 1 --out {tmp}/video"
     ),
+    "python -m tdgc.export --low runs/low/policy --high runs/high/policy --out runs/export": (
+        "--low {tmp}/low/policy --high {tmp}/high/policy --format torchscript --out {tmp}/export"
+    ),
     "python -m tdgc.bench --out runs/bench": (
         "--robots 2 --workers 1 --seconds 0.1 --out {tmp}/bench"
     ),
@@ -79,6 +82,8 @@ OUTPUTS = (
     "tune/tuning.json",
     "video/films/film_gp_nominal_gap_10_000.mp4",
     "video/films/strip_gap_10.png",
+    "export/low.pt",
+    "export/high_interface.json",
     "bench/bench.json",
 )
 PROGRAMS = {
