@@ -259,7 +259,8 @@ def main(arguments: list[str] | None = None) -> int:
         print("tdgc.bench: --workers must be 1 to the number of robots", file=sys.stderr)
         return 2
     if args.cluster is not None and args.workers > cores:
-        print(f"tdgc.bench: the cluster's {cores} CPUs are too few for --workers", file=sys.stderr)
+        few = f"the cluster's {cores} CPUs are too few for {args.workers} workers"
+        print(f"tdgc.bench: {few}", file=sys.stderr)
         return 2
     if args.load:
         name, result = "load.json", compare_loads(args.seconds)

@@ -87,7 +87,7 @@ def _join(address: str) -> None:
     before = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(
-            address=found,
+            address=address,
             runtime_env={"env_vars": dict.fromkeys(BLAS_THREADS, "1")},  # see one_blas_thread
             log_to_driver=False,
             logging_level=logging.WARNING,

@@ -1,5 +1,6 @@
 """Workers on several machines: a cluster of Ray with three nodes, all of them here."""
 
+import json
 import os
 import signal
 import socket
@@ -21,7 +22,7 @@ import evaluate
 import tdgc
 import train_high
 import train_low
-from tdgc import cluster
+from tdgc import bench, cluster
 from tdgc.cluster import ActorLink, ClusterError, connect
 from tdgc.training import Interruption
 from tdgc.vec import TaskVecEnv, worker_seed
@@ -39,6 +40,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     patch = pytest.MonkeyPatch()
     patch.setenv("PYTHONPATH", str(TESTS))  # where the tasks of the tests are
     patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    patch.setenv("RAY_worker_niceness", "0")  # or other work would take all of the time
     patch.delenv("RAY_ADDRESS", raising=False)
     with patch.context() as elsewhere:
         elsewhere.chdir(tmp_path_factory.mktemp("elsewhere"))
@@ -243,6 +245,25 @@ def test_workers_that_are_lost_are_started_elsewhere(joined: Cluster, fragile: T
     last = env.worker_pids
     env.close()
     wait_until_gone([*first, *last])
+
+
+def test_bench_compares_the_cluster_with_this_machine(
+    joined: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--cluster", "auto", "--robots", "4", "--seconds", "0.2", "--out", str(tmp_path)]
+    assert bench.main([*flags, "--workers", "2"]) == 0
+    result = json.loads((tmp_path / "cluster.json").read_text())
+    assert (result["robots"], result["workers"]) == (4, 2)
+    here, there = result["machine"], result["cluster"]
+    for place in (here, there):
+        assert place["steps_per_s"] == pytest.approx(4000.0 / place["ms_per_step"])
+    assert result["overhead"] == pytest.approx(here["steps_per_s"] / there["steps_per_s"] - 1.0)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[:3]] == [
+        "place", "machine", "cluster"
+    ]  # fmt: skip
+    assert bench.main([*flags, "--robots", "9", "--workers", "5"]) == 2
+    expected = "tdgc.bench: the cluster's 4 CPUs are too few for 5 workers\n"
+    assert capsys.readouterr().err == expected
 
 
 # ------------------------------------------------------------------ evaluation
