@@ -22,7 +22,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tdgc import diagnosis, film, gui, plots, report, tuning
+from tdgc import cluster, diagnosis, film, gui, plots, report, tuning
+from tdgc.cluster import CLUSTER_HELP
 from tdgc.config import LowLevelConfig
 from tdgc.cores import usable_cores, workers_flag
 from tdgc.diagnosis import Diagnosis, diagnose
@@ -42,8 +43,9 @@ from tdgc.policies import Policy
 from tdgc.recording import Recorder, Recording, Together
 from tdgc.teacher import STYLES
 from tdgc.terrain import ALL_FAMILIES, FAMILIES, OOD_LEVELS
-from tdgc.trace import Selection, Tracer, check_installed, write
+from tdgc.trace import Selection, Trace, Tracer, check_installed, write
 from tdgc.tuning import TunedDriver, Tuning
+from tdgc.worker import WorkerError
 from tdgc.world import WindowError
 
 POLICIES = ("tdgc", "gp")
@@ -105,6 +107,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
     )
+    parser.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
     parser.add_argument("--out", type=Path, default=Path("runs/evaluation"), help="results folder")
     return parser.parse_args(arguments)
 
@@ -192,22 +195,19 @@ def run_one(
     seed: int,
     filmed: int,
     traced: Selection | None,
-    folder: Path,
-) -> tuple[list[Episode], list[Recording], list[Diagnosis]]:
+) -> tuple[list[Episode], list[Recording], list[Diagnosis], list[Trace]]:
     """A batch, with recordings of the cell's first ``filmed`` episodes; with ``traced`` also its
-    diagnoses, and the chosen traces into ``folder``."""
+    diagnoses and the chosen traces. It writes nothing: it may run on another machine."""
     driver = drivers[cell.policy]
     recorder = Recorder(driver, seed, filmed)
     if traced is None:
-        return run_cell(cell, low, driver, seed, recorder), recorder.recordings(), []
+        return run_cell(cell, low, driver, seed, recorder), recorder.recordings(), [], []
     tracer = Tracer(driver, seed)
     episodes = run_cell(cell, low, driver, seed, Together([tracer, recorder]))
     traces = tracer.traces()
-    for trace in traces:
-        if traced.includes(trace):
-            write(trace, folder)
+    chosen = [trace for trace in traces if traced.includes(trace)]
     diagnoses = [diagnose(trace) for trace in traces if trace.outcome != "reached"]
-    return episodes, recorder.recordings(), diagnoses
+    return episodes, recorder.recordings(), diagnoses, chosen
 
 
 def print_table(summary: dict[str, Any]) -> None:
@@ -226,8 +226,9 @@ def print_table(summary: dict[str, Any]) -> None:
             print(f"mean    {100 * mean['rate']:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}")
 
 
-def run_tracking(low: Policy, args: argparse.Namespace) -> None:
-    result = tracking(low, args.episodes, args.seed, args.workers)
+def run_tracking(low: Policy, args: argparse.Namespace) -> int:
+    share_out = spread if args.cluster is None else cluster.spread
+    result = tracking(low, args.episodes, args.seed, args.workers, share_out)
     (args.out / "tracking.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
     print("gait    velocity RMSE  yaw rate RMSE  contact match")
     for gait, r in result["gaits"].items():
@@ -236,6 +237,7 @@ def run_tracking(low: Policy, args: argparse.Namespace) -> None:
             f"{100 * r['contact_match']:13.1f} %"
         )
     print(f"{result['falls_per_10_min']:.2f} falls in 10 minutes ({result['minutes']:.1f} walked)")
+    return 0
 
 
 def print_effect(effect: dict[str, Any]) -> None:
@@ -273,21 +275,17 @@ def run_table(
     tuned: Tuning | None = None,
 ) -> int:
     """Run all cells and write everything; the exit status, 1 where a film or report is missing."""
-    folder = args.out / "traces"
     work = functools.partial(
-        run_one,
-        low=low,
-        drivers=drivers,
-        seed=args.seed,
-        filmed=args.video,
-        traced=traced,
-        folder=folder,
+        run_one, low=low, drivers=drivers, seed=args.seed, filmed=args.video, traced=traced
     )
+    share_out = spread if args.cluster is None else cluster.spread
     episodes: list[Episode] = []
     recordings: list[Recording] = []
     diagnoses: list[Diagnosis] = []
     with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
-        for rows, recorded, failures in spread(work, cells, args.workers):
+        for rows, recorded, failures, traces in share_out(work, cells, args.workers):
+            for trace in traces:
+                write(trace, args.out / "traces")
             episodes += rows
             recordings += recorded
             diagnoses += failures
@@ -307,7 +305,8 @@ def run_table(
         (args.out / "tuning.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
         print_effect(effect)
     print(f"\ntables and figures are in {args.out}")
-    problems = film.produce(recordings, args.out / "films", args.workers) if recordings else []
+    painters = args.workers if args.cluster is None else usable_cores()
+    problems = film.produce(recordings, args.out / "films", painters) if recordings else []
     try:
         print(f"all of it on one page: {report.write(args.out)}")
     except OSError as error:
@@ -345,8 +344,11 @@ def main(arguments: list[str] | None = None) -> int:
         conditions = choose(args.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition")
         if TEACHER in names and "mixed" in (*families, *conditions):
             raise ValueError(f"the {TEACHER} knows {', '.join(STYLES)}; it cannot lead on mixed")
+        if args.gui is not None and args.cluster is not None:
+            raise ValueError("--gui shows a robot of this machine: no --cluster")
+        cores = usable_cores() if args.cluster is None else cluster.connect(args.cluster)
         if args.workers == "auto":
-            args.workers = usable_cores()
+            args.workers = cores
         for flag, value in (("--episodes", args.episodes), ("--workers", args.workers)):
             if value < 1:
                 raise ValueError(f"{flag} must be at least 1, not {value}")
@@ -375,12 +377,14 @@ def main(arguments: list[str] | None = None) -> int:
     if args.gui is not None:
         first = Cell(next(iter(drivers)), "nominal", families[0], levels[0], 0, 1)
         return run_gui(low, drivers, first, args)
-    if args.tracking:
-        run_tracking(low, args)
-    else:
+    try:
+        if args.tracking:
+            return run_tracking(low, args)
         cells = plan(list(drivers), conditions, families, levels, args.episodes)
         return run_table(low, drivers, cells, args, traced, tuned)
-    return 0
+    except WorkerError as error:
+        print(f"evaluate.py: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

@@ -23,10 +23,11 @@ from tdgc.commands import INDEX, CommandDecoder, default_command
 from tdgc.config import PRESETS, HighTrainConfig, to_dict
 from tdgc.high_env import NavigationTask, check_pair, load_low, summarise
 from tdgc.imitation import Apprentice, ApprenticePolicy
+from tdgc.policies import Policy
 from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.training import Phase, add_arguments, configure, run
 from tdgc.vec import TaskVecEnv
-from tdgc.worker import WorkerError
+from tdgc.worker import MakeLink, WorkerError
 
 
 def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
@@ -44,24 +45,30 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
 
 
 def build(
-    config: HighTrainConfig, device: str, imitating: bool, timeout: float
+    config: HighTrainConfig,
+    low: Policy,
+    device: str,
+    imitating: bool,
+    timeout: float,
+    link: MakeLink,
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
     """Workers and learner of imitation, or of reinforcement learning."""
     guided = config.imitation.steps // config.n_envs if imitating else 0
     env_config = config.env
     if config.imitation.steps:  # what was imitated on all levels goes on on all
         env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
-    probe = NavigationTask(env_config, config.low, 1, seed=0, guided=guided)
+    probe = NavigationTask(env_config, low, 1, seed=0, guided=guided)
     spaces = probe.observation_space, probe.action_space
     probe.close()
     env = TaskVecEnv(
-        functools.partial(NavigationTask, env_config, config.low, guided=guided),
+        functools.partial(NavigationTask, env_config, low, guided=guided),
         config.n_envs,
         config.workers,
         config.seed,
         spaces,
         recover=True,
         timeout=timeout,
+        link=link,
     )
     ppo = config.ppo
     learner, policy = (
@@ -117,7 +124,7 @@ def main(arguments: list[str] | None = None) -> int:
         }
         imitated = min(config.imitation.steps, config.steps)
         phases = [
-            Phase(functools.partial(build, config, args.device, imitating), until)
+            Phase(functools.partial(build, config, low, args.device, imitating), until)
             for imitating, until in ((True, imitated), (False, config.steps))
             if until > 0
         ]

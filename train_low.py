@@ -22,7 +22,7 @@ from tdgc.low_env import LowLevelTask, summarise
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.training import Phase, add_arguments, configure, run
 from tdgc.vec import TaskVecEnv
-from tdgc.worker import WorkerError
+from tdgc.worker import MakeLink, WorkerError
 
 
 def phases(config: LowTrainConfig, device: str) -> list[Phase]:
@@ -40,7 +40,11 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
 
 
 def build(
-    config: LowTrainConfig, env_config: LowLevelConfig, device: str, timeout: float
+    config: LowTrainConfig,
+    env_config: LowLevelConfig,
+    device: str,
+    timeout: float,
+    link: MakeLink,
 ) -> tuple[PPO, TaskVecEnv]:
     """Workers and learner of one phase."""
     probe = LowLevelTask(dataclasses.replace(env_config, terrain="plane"), 1, seed=0)
@@ -52,6 +56,7 @@ def build(
         (probe.observation_space, probe.action_space),
         recover=True,
         timeout=timeout,
+        link=link,
     )
     ppo = config.ppo
     first, last = ppo.learning_rate, ppo.final_learning_rate

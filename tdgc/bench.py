@@ -3,12 +3,15 @@
     python -m tdgc.bench --out runs/bench
     python -m tdgc.bench --load
     python -m tdgc.bench --update
+    python -m tdgc.bench --cluster auto
 
 Robots take random actions in the low level's MDP, on a plane and on all levels of all families,
 with one worker and with all. Writes ``bench.json`` and prints a table. With ``--load`` there are
 10, 100 and 1000 robots on the plane, with 1 to 8 workers, and then the learner alone, with 1 to
 16 threads; the table is in ``load.json``. With ``--update`` the high level's learner updates its
-networks by sb3-contrib's own pass and by the fast one; ``update.json``.
+networks by sb3-contrib's own pass and by the fast one; the table is in ``update.json``. With
+``--cluster`` robots on the plane are simulated by processes of this machine and by actors of Ray in
+turn; the table is in ``cluster.json``.
 """
 
 from __future__ import annotations
@@ -26,24 +29,29 @@ from typing import Any, Literal, cast
 import gymnasium as gym
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.logger import Logger
 
+from tdgc.cluster import CLUSTER_HELP, ActorLink, ClusterError, connect
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
 from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.high_env import NavigationTask
 from tdgc.low_env import LowLevelTask
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
 from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.robot import NUM_JOINTS
 from tdgc.vec import TaskVecEnv
+from tdgc.worker import MakeLink, ProcessLink
 
 _COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
 #: What ``--load`` compares.
 LOAD_ROBOTS, LOAD_WORKERS, LOAD_THREADS = (10, 100, 1000), (1, 2, 4, 8), (1, 2, 4, 8, 16)
 _SETTLE_STEPS = 20  # not timed: robots drop onto their feet
 _EPISODE = 100  # decisions, about the mean of the shipped high level's training
+_TURNS = 10  # of each place in a comparison
 
 
 def spread_levels(env: TaskVecEnv, levels: int) -> None:
@@ -70,28 +78,46 @@ def memory_mb(pids: list[int]) -> float:
     return total
 
 
+def make_env(
+    config: LowLevelConfig, robots: int, workers: int, link: MakeLink = ProcessLink
+) -> TaskVecEnv:
+    probe = LowLevelTask(dataclasses.replace(config, terrain="plane"), 1, seed=0)
+    spaces = probe.observation_space, probe.action_space
+    probe.close()
+    task = functools.partial(LowLevelTask, config)
+    return TaskVecEnv(task, robots, workers, 0, spaces, link=link)
+
+
+def settle(env: TaskVecEnv, levels: int) -> NDArray[np.float32]:
+    """Let the robots drop onto their feet; 64 random actions of all of them, (64, robots, 12)."""
+    spread_levels(env, levels)
+    shape = (64, env.num_envs, NUM_JOINTS)
+    actions = np.random.default_rng(0).normal(0.0, 1.0, shape).astype(np.float32)
+    for k in range(_SETTLE_STEPS):
+        env.step(actions[k])
+    return actions
+
+
+def collect(env: TaskVecEnv, actions: NDArray[np.float32], seconds: float) -> tuple[int, float]:
+    """Take steps for about ``seconds``: their number, and s."""
+    started, steps = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds:
+        env.step(actions[steps % len(actions)])
+        steps += 1
+    return steps, time.perf_counter() - started
+
+
 def measure(config: LowLevelConfig, robots: int, workers: int, seconds: float) -> dict[str, float]:
     """Collect for about ``seconds``: steps_per_s, bullet_share, mb_per_robot, mb_total.
 
     ``bullet_share`` is the time the workers spent inside Bullet's step over the time they spent
     collecting, waiting for actions included.
     """
-    probe = LowLevelTask(dataclasses.replace(config, terrain="plane"), 1, seed=0)
-    spaces = probe.observation_space, probe.action_space
-    probe.close()
-    env = TaskVecEnv(functools.partial(LowLevelTask, config), robots, workers, 0, spaces)
+    env = make_env(config, robots, workers)
     try:
-        spread_levels(env, config.levels)
-        rng = np.random.default_rng(0)
-        actions = rng.normal(0.0, 1.0, (64, robots, spaces[1].shape[0])).astype(np.float32)
-        for k in range(_SETTLE_STEPS):
-            env.step(actions[k])
+        actions = settle(env, config.levels)
         before = sum(s["bullet_seconds"] for s in env.stats())
-        started, steps = time.perf_counter(), 0
-        while time.perf_counter() - started < seconds:
-            env.step(actions[steps % 64])
-            steps += 1
-        elapsed = time.perf_counter() - started
+        steps, elapsed = collect(env, actions, seconds)
         inside = sum(s["bullet_seconds"] for s in env.stats()) - before
         megabytes = memory_mb([os.getpid(), *env.worker_pids])
     finally:
@@ -267,6 +293,37 @@ def compare_updates(updates: int) -> dict[str, float]:
     return result
 
 
+def compare_places(robots: int, workers: int, seconds: float) -> dict[str, Any]:
+    """cluster.json: "machine" and "cluster" -> steps_per_s and ms_per_step, and the "overhead" of
+    the cluster as a share of the machine's time a step; "robots" and "workers" of both.
+
+    Both take turns, so that other work on the machine hits both.
+    """
+    links: dict[str, MakeLink] = {"machine": ProcessLink, "cluster": ActorLink}
+    config = LowLevelConfig()
+    envs: dict[str, TaskVecEnv] = {}
+    result: dict[str, Any] = {"robots": robots, "workers": workers}
+    try:
+        for place, link in links.items():
+            envs[place] = make_env(config, robots, workers, link)
+        actions = {place: settle(env, config.levels) for place, env in envs.items()}
+        sums = {place: np.zeros(2) for place in envs}
+        for _ in range(_TURNS):
+            for place, env in envs.items():
+                sums[place] += collect(env, actions[place], seconds / _TURNS)
+    finally:
+        for env in envs.values():
+            env.close()
+    head("place", "workers", "steps/s", "ms a step")
+    for place, (steps, elapsed) in sums.items():
+        row = {"steps_per_s": steps * robots / elapsed, "ms_per_step": 1000.0 * elapsed / steps}
+        result[place] = row
+        print(f"{place:<8}{workers:>11}{row['steps_per_s']:>11.0f}{row['ms_per_step']:>11.1f}")
+    result["overhead"] = result["cluster"]["ms_per_step"] / result["machine"]["ms_per_step"] - 1.0
+    print(f"the cluster takes {100.0 * result['overhead']:.1f} % more time")
+    return result
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--robots", type=int, default=100)
@@ -277,17 +334,29 @@ def main(arguments: list[str] | None = None) -> int:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--load", action="store_true", help="compare robots, workers and threads")
     what.add_argument("--update", action="store_true", help="compare the high level's updates")
+    what.add_argument("--cluster", metavar="ADDRESS", help=f"compare: {CLUSTER_HELP}")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     args = parser.parse_args(arguments)
+    try:
+        cores = usable_cores() if args.cluster is None else connect(args.cluster)
+    except ClusterError as error:
+        print(f"tdgc.bench: {error}", file=sys.stderr)
+        return 2
     if args.workers == "auto":
-        args.workers = auto_workers(args.robots, usable_cores())
+        args.workers = auto_workers(args.robots, min(cores, usable_cores()))
     if not 1 <= args.workers <= args.robots:
         print("tdgc.bench: --workers must be 1 to the number of robots", file=sys.stderr)
+        return 2
+    if args.cluster is not None and args.workers > cores:
+        few = f"the cluster's {cores} CPUs are too few for {args.workers} workers"
+        print(f"tdgc.bench: {few}", file=sys.stderr)
         return 2
     if args.load:
         name, result = "load.json", compare_loads(args.seconds)
     elif args.update:
         name, result = "update.json", compare_updates(updates=10)
+    elif args.cluster is not None:
+        name, result = "cluster.json", compare_places(args.robots, args.workers, args.seconds)
     else:
         name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
     args.out.mkdir(parents=True, exist_ok=True)

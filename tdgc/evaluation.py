@@ -8,7 +8,6 @@ the table.
 from __future__ import annotations
 
 import csv
-import ctypes
 import dataclasses
 import functools
 import json
@@ -31,7 +30,7 @@ from tdgc.policies import Policy
 from tdgc.rewards import CONTACT_FORCE
 from tdgc.robot import NUM_JOINTS, Array, RobotState
 from tdgc.terrain import ALL_FAMILIES, EVAL_STREAM, MAX_LEVEL, Tile, TileField, make_tile, tile_rng
-from tdgc.worker import one_blas_thread
+from tdgc.worker import keep_memory, one_blas_thread
 
 HORIZON = 20.0  # s (benchmark)
 OUTCOMES = ("reached", "fell", "collided", "left_tile", "timeout")
@@ -327,21 +326,6 @@ def plan(
     return cells
 
 
-_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
-
-
-def keep_memory() -> None:
-    """Let this process keep the memory that it frees, where the C library is glibc.
-
-    A batch's tiles take hundreds of MB. Taking them anew from the system, page by page, was four
-    fifths of the time in which a world is made.
-    """
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "mallopt"):
-        libc.mallopt(_M_MMAP_MAX, 0)  # all from the heap, none from mappings
-        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)  # and its top is not given back
-
-
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
@@ -352,6 +336,14 @@ def spread(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> 
     spawn = mp.get_context("spawn")
     with one_blas_thread(), spawn.Pool(processes, initializer=keep_memory) as pool:
         yield from pool.imap(work, jobs)
+
+
+class Spread(Protocol):
+    """``spread``, or what does the same elsewhere."""
+
+    def __call__(
+        self, work: Callable[[Job], Result], jobs: Sequence[Job], workers: int
+    ) -> Iterator[Result]: ...
 
 
 def wilson_interval(reached: int, n: int, z: float = 1.959964) -> tuple[float, float]:
@@ -503,10 +495,12 @@ def _track(job: tuple[str, int, int], low: Policy) -> dict[str, float]:
     return track_gait(low, gait, episodes, seed) if gait else count_falls(low, episodes, seed)
 
 
-def tracking(low: Policy, episodes: int, seed: int, workers: int) -> dict[str, Any]:
-    """tracking.json: each gait's tracking and the falls."""
+def tracking(
+    low: Policy, episodes: int, seed: int, workers: int, share_out: Spread = spread
+) -> dict[str, Any]:
+    """tracking.json: each gait's tracking and the falls; ``share_out`` is a kind of ``spread``."""
     robots = max(1, round(_FALL_SHARE * episodes))
     jobs = [(gait, episodes, seed) for gait in GAITS] + [("", robots, seed)]
-    results = list(spread(functools.partial(_track, low=low), jobs, workers))
+    results = list(share_out(functools.partial(_track, low=low), jobs, workers))
     falls = results.pop()
     return {"gaits": dict(zip(GAITS, results, strict=True)), **falls}

@@ -177,15 +177,15 @@ def check_pair(high: HighLevelConfig, low: LowLevelConfig) -> None:
             )
 
 
-def load_low(path: str | Path) -> tuple[Policy, LowLevelConfig]:
-    """A low-level policy and the MDP it was trained on.
+def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
+    """A low-level policy, given itself or by its path, and the MDP it was trained on.
 
     Raises:
-        ValueError: a file that cannot be used, or that is no low level.
+        ValueError: a file that cannot be used, or a policy that is no low level.
     """
-    low = policies.load(path)
+    name, low = low, low if isinstance(low, Policy) else policies.load(low)
     if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
-        raise ConfigError(f"{path}: not a low-level policy of this package")
+        raise ConfigError(f"{name}: not a low-level policy of this package")
     return low, from_dict(LowLevelConfig, low.meta["config"])
 
 
@@ -198,7 +198,8 @@ class NavigationTask:
 
     Args:
         config: the MDP's configuration.
-        low: path of the low-level policy.
+        low: the low-level policy, or its path; a task that is made on another machine needs the
+            policy itself.
         num_robots: M.
         seed: of everything random here.
         training: draw disturbances and let the curriculum move levels.
@@ -211,7 +212,7 @@ class NavigationTask:
     def __init__(
         self,
         config: HighLevelConfig,
-        low: str | Path,
+        low: str | Path | Policy,
         num_robots: int,
         seed: int,
         training: bool = True,

@@ -38,12 +38,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tqdm import tqdm
 
 from tdgc import __version__, policies
+from tdgc.cluster import CLUSTER_HELP, ActorLink, ClusterError, connect
 from tdgc.config import Config, ConfigError, from_dict, read_json, to_dict, with_overrides
 from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.errors import InputError
 from tdgc.state import State, join, split
 from tdgc.vec import TaskVecEnv
-from tdgc.worker import WorkerError
+from tdgc.worker import MakeLink, ProcessLink, WorkerError
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
 _VERSION = 2
@@ -462,11 +463,11 @@ class Phase:
     """A stretch of a run with its own environment.
 
     Attributes:
-        build: makes the learner and its workers, given their ``timeout``.
+        build: makes the learner and its workers, given their ``timeout`` and what starts one.
         until: steps of the run at which the phase ends.
     """
 
-    build: Callable[[float], tuple[Any, TaskVecEnv]]
+    build: Callable[[float, MakeLink], tuple[Any, TaskVecEnv]]
     until: int
 
 
@@ -482,6 +483,7 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
         "--worker-timeout", type=float, default=300.0, metavar="S",
         help="start a worker anew that is silent for S seconds (300)",
     )  # fmt: skip
+    parser.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
     parser.add_argument("--steps", type=int, help="steps altogether")
     parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds")
     parser.add_argument("--device", default="cpu", help="where the learner runs (cpu)")
@@ -497,8 +499,11 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
 def configure(config: Config, args: argparse.Namespace) -> Config:
     """Configuration of the run: the folder's when resuming, else ``config``, then the flags.
 
+    With ``--cluster`` this process joins it.
+
     Raises:
         ConfigError: nothing to resume, a folder in use, or an assignment that cannot be used.
+        ClusterError: a cluster that cannot be used, or has fewer CPUs than there are workers.
     """
     stored = args.out / "config.json"
     if args.resume:
@@ -513,9 +518,13 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
     given = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
     config = with_overrides(config, [*given, *args.assignments])
+    cores = usable_cores() if args.cluster is None else connect(args.cluster)
     if args.workers == "auto" and not args.resume:  # a run goes on with as many as it began with
-        workers = auto_workers(to_dict(config)["n_envs"], usable_cores())
+        workers = auto_workers(to_dict(config)["n_envs"], cores)
         config = with_overrides(config, [f"workers={workers}"])
+    workers = to_dict(config)["workers"]
+    if args.cluster is not None and workers > cores:
+        raise ClusterError(f"the cluster's {cores} CPUs are too few for {workers} workers")
     return config
 
 
@@ -547,12 +556,13 @@ def run(
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "config.json").write_text(json.dumps(to_dict(config), indent=2), encoding="utf-8")
     interruption = Interruption(args.time_limit)
+    link: MakeLink = ProcessLink if args.cluster is None else ActorLink
     seconds = float(carried[1]["seconds"]) if carried else 0.0
     finished, unsaved = True, None
     for number, phase in enumerate(phases):
         if carried is not None and int(carried[1]["num_timesteps"]) >= phase.until:
             continue
-        model, env = phase.build(args.worker_timeout)
+        model, env = phase.build(args.worker_timeout, link)
         try:
             model.set_logger(tensorboard_logger(args.out / "tensorboard"))
             callback = RunCallback(

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from tdgc.state import State, copies
-from tdgc.worker import Arrays, Link, MakeTask, ProcessLink, WorkerError
+from tdgc.worker import Arrays, Link, MakeLink, MakeTask, ProcessLink, WorkerError
 
 #: Faults of workers within so many steps that stop a run. A fault of the code comes back at once
-#: or in every episode, and the low level's last 1000 steps; one of the machine does not.
+#: or in every episode, and the low level's last 1000 steps; one of the machine does not. Workers
+#: that fail in one step count once: a machine takes all of its own with it.
 FAULTS, FAULT_STEPS = 3, 1000
 # s to start in: ten times what imports and 60 robots' worlds took on a core shared by ten.
 _START_SECONDS = 600.0
@@ -64,8 +65,8 @@ class TaskVecEnv(VecEnv):
 
     With ``recover`` a worker that dies, hangs or raises is started anew with a seed of its own and
     what its robots had learned when its state was last asked for (see ``state_dicts``); their
-    episodes end, truncated, with no reward for the step. ``FAULTS`` faults within ``FAULT_STEPS``
-    steps are raised all the same.
+    episodes end, truncated, with no reward for the step. Faults at ``FAULTS`` times within
+    ``FAULT_STEPS`` steps are raised all the same.
 
     Args:
         make_task: picklable, called in each worker as ``make_task(robots, seed)``.
@@ -76,6 +77,7 @@ class TaskVecEnv(VecEnv):
         recover: start workers that fail anew; otherwise the first fault is raised.
         timeout: s without an answer after which a worker counts as hung. Of all that is asked,
             building the worlds of 60 robots on terrain takes longest: 3 s of a core.
+        link: starts a worker; a process of this machine unless told.
 
     Attributes:
         faults: those mended so far; whoever tells of them takes them out.
@@ -94,6 +96,7 @@ class TaskVecEnv(VecEnv):
         spaces: tuple[gym.spaces.Box, gym.spaces.Box],
         recover: bool = False,
         timeout: float = 300.0,
+        link: MakeLink = ProcessLink,
     ) -> None:
         if not 1 <= workers <= num_envs:
             raise ValueError(f"workers must be 1 to the {num_envs} robots, not {workers}")
@@ -103,6 +106,7 @@ class TaskVecEnv(VecEnv):
         self.timeout = timeout
         self.faults: list[Fault] = []
         self._make_task, self._seed, self._recover = make_task, seed, recover
+        self._link = link
         self._arrays = Arrays(num_envs, spaces[0].shape[0], spaces[1].shape[0])
         self._views = self._arrays.views()
         bounds = np.linspace(0, num_envs, workers + 1).astype(int).tolist()
@@ -128,7 +132,7 @@ class TaskVecEnv(VecEnv):
 
     def _start(self, worker: int, state: State | None = None) -> Link:
         seed = worker_seed(self._seed, worker, self._restarts[worker])
-        return ProcessLink(worker, self._make_task, self._arrays, self._rows[worker], seed, state)
+        return self._link(worker, self._make_task, self._arrays, self._rows[worker], seed, state)
 
     def _replace(self, worker: int, restarts: int, state: State | None = None) -> None:
         """Put a new worker in another one's place; it has to be waited for."""
@@ -181,18 +185,21 @@ class TaskVecEnv(VecEnv):
         """
         concerned = np.zeros(self.num_envs, dtype=bool)
         while self._broken:
-            worker, fault = next(iter(self._broken.items()))
+            broken = sorted(self._broken.items())
             self._fault_steps.append(self._steps)
             if self._steps - self._fault_steps[0] < FAULT_STEPS:
                 raise WorkerError(
-                    f"{FAULTS} faults of workers within {FAULT_STEPS} steps; the last one: {fault}"
+                    f"{FAULTS} faults of workers within {FAULT_STEPS} steps; "
+                    f"the last one: {broken[-1][1]}"
                 )
-            restarts = self._restarts[worker] + 1
-            self._replace(worker, restarts, self._states[worker])
-            seed = worker_seed(self._seed, worker, restarts)
-            self.faults.append(Fault(worker, str(fault), restarts, seed))
-            self._receive(worker, _START_SECONDS)
-            concerned[self._rows[worker]] = True
+            for worker, fault in broken:
+                restarts = self._restarts[worker] + 1
+                self._replace(worker, restarts, self._states[worker])
+                seed = worker_seed(self._seed, worker, restarts)
+                self.faults.append(Fault(worker, str(fault), restarts, seed))
+            for worker, _ in broken:
+                self._receive(worker, _START_SECONDS)
+                concerned[self._rows[worker]] = True
         return concerned
 
     # ------------------------------------------------------------------ as SB3 wants it

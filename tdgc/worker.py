@@ -11,6 +11,7 @@ would take 150 MB more.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import multiprocessing as mp
 import os
 import pickle
@@ -99,6 +100,10 @@ class Link(Protocol):
 
     def end(self, timeout: float) -> None:
         """End it, by force if it has not ended by itself within ``timeout`` s."""
+
+
+#: (number, task, arrays of all robots, its rows of them, seed, state, see ``Worker``) -> a worker.
+MakeLink = Callable[[int, MakeTask, "Arrays", slice, int, State | None], Link]
 
 
 # ---------------------------------------------------------------------------- the worker
@@ -261,6 +266,10 @@ def _serve(
             worker.task.close()
 
 
+#: What sets the number of threads of a linear algebra call, whichever library makes it.
+BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
 @contextlib.contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Processes started within get one thread a linear algebra call.
@@ -268,9 +277,8 @@ def one_blas_thread() -> Iterator[None]:
     Workers share the cores already, and threads that wait for each other on a busy core make a
     matrix product of this size forty times slower.
     """
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
+    before = {name: os.environ.get(name) for name in BLAS_THREADS}
+    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
     try:
         yield
     finally:
@@ -279,6 +287,21 @@ def one_blas_thread() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
+
+
+def keep_memory() -> None:
+    """Let this process keep the memory that it frees, where the C library is glibc.
+
+    A batch's tiles take hundreds of MB. Taking them anew from the system, page by page, was four
+    fifths of the time in which a world is made.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        libc.mallopt(_M_MMAP_MAX, 0)  # all from the heap, none from mappings
+        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)  # and its top is not given back
 
 
 @contextlib.contextmanager
@@ -312,7 +335,7 @@ class ProcessLink:
         arrays: Arrays,
         rows: slice,
         seed: int,
-        state: State | None = None,
+        state: State | None,
     ) -> None:
         context = mp.get_context("spawn")
         self._worker = worker

@@ -30,6 +30,7 @@ RANKS = {
     "tiles": 2,
     "robot": 3,
     "worker": 2,
+    "cluster": 3,
     "world": 4,
     "rewards": 4,
     "locomotion": 5,
@@ -116,6 +117,15 @@ def test_only_world_imports_pybullet(module: str) -> None:
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     bullet = [name for name in imports(tree) if name.startswith("pybullet")]
     assert bool(bullet) == (module == "world"), f"{module}: {bullet}"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_only_cluster_imports_ray_and_not_before_it_is_asked_for(module: str) -> None:
+    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+    asked = [name for name in imports(tree) if name.partition(".")[0] == "ray"]
+    assert bool(asked) == (module == "cluster"), f"{module}: {asked}"
+    at_once = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
+    assert not [name for name in imports(at_once) if name.partition(".")[0] == "ray"]
 
 
 def test_rules_see_every_kind_of_import() -> None:
