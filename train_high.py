@@ -71,13 +71,18 @@ def build(
         link=link,
     )
     ppo = config.ppo
+    first, last = ppo.learning_rate, ppo.final_learning_rate
     learner, policy = (
         (Apprentice, ApprenticePolicy) if imitating else (FastRecurrentPPO, FastRecurrentPolicy)
     )
     model = learner(
         policy,
         env,
-        learning_rate=config.imitation.learning_rate if imitating else ppo.learning_rate,
+        learning_rate=(
+            config.imitation.learning_rate
+            if imitating
+            else lambda remaining: last + remaining * (first - last)
+        ),
         n_steps=ppo.n_steps,
         batch_size=ppo.n_steps * config.n_envs // ppo.minibatches,
         n_epochs=config.imitation.n_epochs if imitating else ppo.n_epochs,

@@ -44,7 +44,7 @@ from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
 from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.robot import NUM_JOINTS
 from tdgc.vec import TaskVecEnv
-from tdgc.worker import MakeLink, ProcessLink
+from tdgc.worker import MakeLink, ProcessLink, memory_mb
 
 _COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
 #: What ``--load`` compares.
@@ -66,16 +66,6 @@ def spread_levels(env: TaskVecEnv, levels: int) -> None:
             for state in env.state_dicts()
         ]
     )
-
-
-def memory_mb(pids: list[int]) -> float:
-    """Memory of processes in MB, shared pages counted once (proportional set size)."""
-    total = 0.0
-    for pid in pids:
-        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
-            if line.startswith("Pss:"):
-                total += int(line.split()[1]) / 1024.0
-    return total
 
 
 def make_env(
@@ -119,7 +109,7 @@ def measure(config: LowLevelConfig, robots: int, workers: int, seconds: float) -
         before = sum(s["bullet_seconds"] for s in env.stats())
         steps, elapsed = collect(env, actions, seconds)
         inside = sum(s["bullet_seconds"] for s in env.stats()) - before
-        megabytes = memory_mb([os.getpid(), *env.worker_pids])
+        megabytes = sum(map(memory_mb, (os.getpid(), *env.worker_pids)))
     finally:
         env.close()
     return {

@@ -13,6 +13,7 @@ import dataclasses
 import errno
 import hashlib
 import json
+import math
 import os
 import random
 import shutil
@@ -43,8 +44,8 @@ from tdgc.config import Config, ConfigError, from_dict, read_json, to_dict, with
 from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.errors import InputError
 from tdgc.state import State, join, split
-from tdgc.vec import TaskVecEnv
-from tdgc.worker import MakeLink, ProcessLink, WorkerError
+from tdgc.vec import TaskVecEnv, lasting
+from tdgc.worker import MakeLink, ProcessLink, WorkerError, memory_mb
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
 _VERSION = 2
@@ -358,11 +359,14 @@ class RunCallback(BaseCallback):
             values["episode/length"] = float(np.mean(lengths))
         for name in (
             "imitation_loss", "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction",
-            "std",
+            "std", "learning_rate",
         ):  # fmt: skip
             number = self.logger.name_to_value.get(f"train/{name}")
             if number is not None:
                 values[f"train/{name}"] = float(number)
+        memory = sums.get("memory_mb", 0.0) + memory_mb(os.getpid())
+        if math.isfinite(memory):
+            values["memory/mb"] = memory
         values["faults/blow_ups"] = sums.get("blow_ups", 0.0)
         values["faults/restarts"] = float(len(self._faults))
         row: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self.seconds, 1)}
@@ -573,10 +577,13 @@ def run(
                 load_learner(model, *carried)
             elif args.init is not None:
                 policies.load_into(args.init, model.policy)
-            if carried is not None and carried[1]["phase"] == number:
-                env.load_state_dicts(workers_of(*carried))
-            else:
+            if carried is None:
                 env.reset()
+            else:
+                states = workers_of(*carried)
+                if carried[1]["phase"] != number:  # episodes end with a phase, levels go on
+                    states = [lasting(state) for state in states]
+                env.load_state_dicts(states)
             attach(model, env)
             try:
                 finished = learn(model, callback, phase.until)

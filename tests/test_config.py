@@ -166,7 +166,9 @@ def test_the_papers_preset_is_its_table() -> None:
     config = with_overrides(HighTrainConfig(), PRESETS["paper"])
     assert (config.seed, config.n_envs, config.env.decimation) == (42, 100, 1)
     ppo = config.ppo
+    assert config.steps == 20_000 * ppo.n_steps * config.n_envs
     assert (ppo.learning_rate, ppo.ent_coef, ppo.clip_range) == (1e-4, 1e-4, 0.2)
+    assert ppo.final_learning_rate == ppo.learning_rate
     assert (ppo.gamma, ppo.gae_lambda) == (0.99, 0.95)
     assert (ppo.n_steps, ppo.n_epochs, ppo.minibatches) == (24, 5, 4)
     assert with_overrides(HighTrainConfig(), PRESETS["default"]) == HighTrainConfig()

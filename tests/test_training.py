@@ -341,6 +341,7 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     names = sorted(path.name for path in (whole / "checkpoints").iterdir())
     assert names == ["step-000000000064", "step-000000000160"]  # the ends of both phases
     assert [row["steps"] for row in rows(whole)] == [64, 128]
+    assert all(100.0 < row["memory/mb"] < 4000.0 for row in rows(whole))
     assert rows(whole)[1]["reward/track_lin_vel"] > 0.0 and "level/stair" in rows(whole)[1]
     stored = from_dict(LowTrainConfig, json.loads((whole / "config.json").read_text()))
     expected = LowTrainConfig(
@@ -392,6 +393,9 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         train_high.main([*arguments, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     )
     assert [row["steps"] for row in rows(whole)] == [16, 32]
+    # Of imitation, and of reinforcement learning after 24 of 40 steps: from 5e-4 to 1e-4.
+    rates = [row["train/learning_rate"] for row in rows(whole)]
+    assert rates == pytest.approx([1e-3, 1e-4 + 0.4 * 4e-4])
     last = broken / "checkpoints/step-000000000024"
     with monkeypatch.context() as patch:
         at_calls(patch, lambda call, run: setattr(run, "reason", "a test" if call == 2 else None))
@@ -406,6 +410,19 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert tensors["lstm.pi.h"].any()
     assert train_high.main(["--resume", "--out", str(broken)]) == 0
     assert final(broken) == final(whole)
+
+
+def test_levels_go_on_into_the_next_phase(tmp_path: Path) -> None:
+    """Episodes do not. An update on tiles is too short for a level to fall by more than one."""
+    assert train_low.main([*TINY, "--steps", "64", "--out", str(tmp_path)]) == 0
+    tensors, header = read_checkpoint(newest(tmp_path))
+    for state in workers_of(tensors, header):  # views of the tensors
+        state["level"][:], state["command_share"][:] = 8, 0.9
+    save_checkpoint(tmp_path / "checkpoints", tensors, header)
+    assert train_low.main(["--resume", "--steps", "96", "--out", str(tmp_path)]) == 0
+    for state in workers_of(*read_checkpoint(newest(tmp_path))):
+        assert (state["level"] >= 7).all() and (state["command_share"] >= 0.9).all()
+        assert state["lengths"].max() == 8
 
 
 def test_a_run_of_version_1_goes_on(tmp_path: Path) -> None:
