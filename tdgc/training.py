@@ -48,8 +48,10 @@ from tdgc.vec import TaskVecEnv, lasting
 from tdgc.worker import MakeLink, ProcessLink, WorkerError, memory_mb
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
-_VERSION = 2
-_READABLE = (1, 2)  # version 1 has no episodes under way: its runs go on with new ones
+_VERSION = 3
+#: Version 1 has no episodes under way: its runs go on with new ones. The checksum of 1 and 2 is of
+#: the tensors alone.
+_READABLE = (1, 2, 3)
 #: Names of what the recurrent learner remembers of the episodes under way.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
@@ -109,6 +111,15 @@ def snapshot(
     return tensors | random_tensors, header
 
 
+def _checksum(data: bytes, header: dict[str, Any]) -> str:
+    """Of the tensors' file and of all that stands beside it in the header."""
+    digest = hashlib.sha256(data)
+    if header["version"] >= 3:
+        rest = {key: value for key, value in header.items() if key != "sha256"}
+        digest.update(json.dumps(rest, sort_keys=True).encode())
+    return digest.hexdigest()
+
+
 def save_checkpoint(folder: Path, tensors: dict[str, th.Tensor], header: dict[str, Any]) -> Path:
     """Write a snapshot; a reader sees it complete or not at all.
 
@@ -116,7 +127,8 @@ def save_checkpoint(folder: Path, tensors: dict[str, th.Tensor], header: dict[st
         OSError: it cannot be written; those before it are left as they are.
     """
     data = safetensors.torch.save({k: v.contiguous() for k, v in tensors.items()})
-    text = json.dumps({**header, "sha256": hashlib.sha256(data).hexdigest()})
+    header = json.loads(json.dumps(header))  # as a reader will have it
+    text = json.dumps({**header, "sha256": _checksum(data, header)})
     final = folder / f"step-{header['num_timesteps']:012d}"
     partial = folder / f".{final.name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
@@ -153,7 +165,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
         for counter in ("num_timesteps", "n_updates"):
             if type(header.get(counter)) is not int or not 0 <= header[counter] < 2**63:
                 raise CheckpointError(f"{path}: '{counter}' is no count")
-        if hashlib.sha256(data).hexdigest() != header["sha256"]:
+        if _checksum(data, header) != header["sha256"]:
             raise CheckpointError(f"{path}: its checksum does not match, it is damaged")
         return safetensors.torch.load(data), header
     except CheckpointError:

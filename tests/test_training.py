@@ -152,14 +152,20 @@ def listed(path: Path) -> None:
 
 def newer(path: Path) -> None:
     header = json.loads((path / "state.json").read_text(encoding="utf-8"))
-    (path / "state.json").write_text(json.dumps({**header, "version": 3}), encoding="utf-8")
+    (path / "state.json").write_text(json.dumps({**header, "version": 4}), encoding="utf-8")
+
+
+def later(path: Path) -> None:
+    header = json.loads((path / "state.json").read_text(encoding="utf-8"))
+    later = header["n_updates"] + 1
+    (path / "state.json").write_text(json.dumps({**header, "n_updates": later}), encoding="utf-8")
 
 
 def remove(path: Path) -> None:
     (path / "state.safetensors").unlink()
 
 
-@pytest.mark.parametrize("damage", [truncate, flip, garble, foreign, listed, newer, remove])
+@pytest.mark.parametrize("damage", [truncate, flip, garble, foreign, listed, newer, later, remove])
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(damage: Any, tmp_path: Path) -> None:
     before, newest = three(tmp_path)
     damage(newest)
@@ -445,7 +451,7 @@ def test_a_run_of_version_1_goes_on(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({**config, "checkpoint_steps": 200}))
     assert train_low.main(["--resume", "--steps", "96", "--out", str(tmp_path)]) == 0
     tensors, header = read_checkpoint(newest(tmp_path))
-    assert (header["num_timesteps"], header["version"]) == (96, 2)
+    assert (header["num_timesteps"], header["version"]) == (96, 3)
     after = workers_of(tensors, header)
     assert all(np.abs(state["level"] - [7, 8]).max() <= 1 for state in after)
     assert [s["tiles_drawn"] > t["tiles_drawn"] for s, t in zip(after, states, strict=True)] == [
