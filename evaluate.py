@@ -32,12 +32,14 @@ from tdgc.evaluation import (
     CONDITIONS,
     Cell,
     Episode,
+    low_config,
     plan,
     run_cell,
     spread,
     tracking,
     write_results,
 )
+from tdgc.geometry import read_geometry
 from tdgc.high_env import PRETRAINED, load_low
 from tdgc.policies import Policy
 from tdgc.recording import Recorder, Recording, Together
@@ -206,7 +208,8 @@ def run_one(
     episodes = run_cell(cell, low, driver, seed, Together([tracer, recorder]))
     traces = tracer.traces()
     chosen = [trace for trace in traces if traced.includes(trace)]
-    diagnoses = [diagnose(trace) for trace in traces if trace.outcome != "reached"]
+    hips = float(read_geometry(low_config(low).robot).hips[0, 0])
+    diagnoses = [diagnose(trace, hips) for trace in traces if trace.outcome != "reached"]
     return episodes, recorder.recordings(), diagnoses, chosen
 
 

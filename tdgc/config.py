@@ -31,11 +31,11 @@ class ConfigError(InputError):
 class RobotConfig:
     """The robot and its joint interface (paper Sec. IV-A, q* = q0 + alpha clip(a)).
 
-    Masses and lengths are in ``urdf/quadruped.urdf``; leg order FL, FR, RL, RR everywhere and
-    joints hip, thigh, calf within a leg.
+    Masses, lengths and joint limits are read from the URDF (``tdgc.geometry``); leg order FL, FR,
+    RL, RR everywhere and joints hip, thigh, calf within a leg.
     """
 
-    urdf: str = "urdf/quadruped.urdf"
+    urdf: str = "urdf/quadruped.urdf"  # path, from here or from the repository
     kp: float = 20.0  # N m/rad (benchmark, Walk These Ways)
     kd: float = 0.6  # N m s/rad (benchmark: 0.5-0.7)
     torque_limit: tuple[float, float, float] = (23.7, 23.7, 35.5)  # N m, hip thigh calf (Go1)

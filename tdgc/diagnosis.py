@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.evaluation import Episode, tile_of
-from tdgc.robot import HIPS_XY, Array
+from tdgc.robot import Array
 from tdgc.terrain import (
     FAMILIES,
     GOAL_BEGIN,
@@ -46,10 +46,10 @@ LAYERS = ("decisions", "execution", "terrain")
 
 LOOK_BACK = 2.0  # s before the end that are judged: four to eight gait cycles
 SETTLE = 1.0  # s at the start that are not: speeding up from rest, as in the tracking test
-#: m from the trunk's centre: how far ahead the hips are, and a foot that reaches out from there. A
-#: trunk was hit at up to 0.25 m from a pillar's edge, a robot held up by one stood at up to 0.29 m.
-HIPS = float(HIPS_XY[0, 0])
-REACH = HIPS + 0.2
+#: m ahead of the hips: a foot that reaches out from there. With hips 0.18 m ahead of the trunk's
+#: centre a trunk was hit at up to 0.25 m from a pillar's edge, and a robot held up by one stood at
+#: up to 0.29 m.
+REACH = 0.2
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,12 @@ class Diagnosis:
     evidence: str
 
 
-def diagnose(trace: Trace) -> Diagnosis:
+def diagnose(trace: Trace, hips: float) -> Diagnosis:
     """Which layer failed in the episode of ``trace``, and why.
+
+    Args:
+        trace: of an episode that failed.
+        hips: m, how far ahead of the trunk's centre the robot's hips are.
 
     Raises:
         ValueError: it did not fail.
@@ -118,7 +122,7 @@ def diagnose(trace: Trace) -> Diagnosis:
     x, y = float(trace["base_x"][-1]), float(trace["base_y"][-1])
     found = sorted(features(tile, x, y), key=lambda feature: feature[1])
     feature = f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
-    layer, cause, evidence = _judge(trace, tile)
+    layer, cause, evidence = _judge(trace, tile, hips)
     return Diagnosis(
         trace.policy,
         trace.condition,
@@ -139,11 +143,11 @@ def diagnose(trace: Trace) -> Diagnosis:
 # ---------------------------------------------------------------------------- which layer
 
 
-def _judge(trace: Trace, tile: Tile) -> tuple[str, str, str]:
+def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
     """Layer, cause and evidence."""
-    intervals, held = judged(trace), near_pillar(trace, tile)
+    intervals, held = judged(trace), near_pillar(trace, tile, hips + REACH)
     # Against a pillar or over the edge nothing is tracked, and that is no fault of who tracks.
-    errors = tracking_errors(trace, intervals & ~(held | near_edge(trace))[1:])
+    errors = tracking_errors(trace, intervals & ~(held | near_edge(trace, hips))[1:])
     limits = {
         name: limit.episode if trace.outcome == "timeout" else limit.stretch
         for name, limit in LIMITS.items()
@@ -210,17 +214,17 @@ def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
     return float(np.average(towards[intervals], weights=trace["seconds"][1:][intervals]))
 
 
-def near_pillar(trace: Trace, tile: Tile) -> NDArray[np.bool_]:
-    """Where the trunk was within ``REACH`` of a pillar, (n,): it may be held up by it."""
+def near_pillar(trace: Trace, tile: Tile, reach: float) -> NDArray[np.bool_]:
+    """Where the trunk was within ``reach`` m of a pillar, (n,): it may be held up by it."""
     x, y = trace["base_x"], trace["base_y"]
-    return np.array([_to_pillar(tile, *at)[0] < REACH for at in zip(x, y, strict=True)])
+    return np.array([_to_pillar(tile, *at)[0] < reach for at in zip(x, y, strict=True)])
 
 
-def near_edge(trace: Trace) -> NDArray[np.bool_]:
-    """Where the trunk was within ``HIPS`` of the tile's edge, (n,): feet stand on nothing there."""
+def near_edge(trace: Trace, hips: float) -> NDArray[np.bool_]:
+    """Where the trunk was within ``hips`` m of the tile's edge, (n,): feet have nothing there."""
     x, y = trace["base_x"], trace["base_y"]
     inside = np.minimum(np.minimum(x, TILE_SIZE - x), np.minimum(y, TILE_SIZE - y))
-    return np.asarray(inside < HIPS)
+    return np.asarray(inside < hips)
 
 
 def _evidence(

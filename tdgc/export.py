@@ -50,6 +50,7 @@ from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelCon
 from tdgc.drivers import load_high
 from tdgc.errors import install_hint
 from tdgc.gaits import FEET, GAIT_TABLE, GAITS
+from tdgc.geometry import FRONT, JOINTS, SIDE, read_geometry
 from tdgc.high_env import (
     GOAL_SCALE,
     PRETRAINED,
@@ -66,14 +67,8 @@ from tdgc.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE
 from tdgc.low_env import is_fallen
 from tdgc.policies import Policy
 from tdgc.robot import (
-    ABDUCTION,
-    CALF,
     HIGHEST_FOOT,
-    HIPS_XY,
-    JOINT_LIMITS,
-    JOINTS,
     NUM_JOINTS,
-    THIGH,
     Array,
     foot_kinematics,
     joint_targets,
@@ -177,11 +172,14 @@ class Pose(nn.Module):
         super().__init__()
         nominal = nominal_pose(robot)
         self.follows, self.nominal = robot.commanded_pose, _constant(nominal)
-        standing = foot_kinematics(nominal[None], np.zeros((1, NUM_JOINTS)))[0][0]
-        hips = np.pad(HIPS_XY, ((0, 0), (0, 1)))
-        self.feet, self.default = _constant(standing - hips), _constant(default_command())
-        self.front, self.side = (_constant(np.sign(HIPS_XY[:, i])) for i in (0, 1))
-        self.lowest, self.highest = (float(x) for x in JOINT_LIMITS[2])
+        geometry = read_geometry(robot)
+        self.thigh, self.calf = geometry.thigh, geometry.calf
+        standing, _ = foot_kinematics(geometry, nominal[None], np.zeros((1, NUM_JOINTS)))
+        hips = np.pad(geometry.hips, ((0, 0), (0, 1)))
+        self.feet, self.default = _constant(standing[0] - hips), _constant(default_command())
+        self.front, self.side = _constant(FRONT), _constant(SIDE)
+        self.out = _constant(geometry.abduction * SIDE)
+        self.lowest, self.highest = map(_constant, geometry.joint_limits[2::3].T)
 
     def forward(self, clock: Tensor, command: Tensor) -> Tensor:
         if not self.follows:
@@ -193,13 +191,14 @@ class Pose(nn.Module):
         y = self.feet[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
         z = self.feet[:, 2] - change[INDEX["body_height"]]
         z = (z + change[INDEX["swing_height"]] * raised).clamp(max=HIGHEST_FOOT)
-        out = ABDUCTION * self.side
+        out, upper, lower = self.out, self.thigh, self.calf
         down = (y * y + z * z - out * out).clamp(min=0.0).sqrt()
-        bend = (x * x + down * down - THIGH * THIGH - CALF * CALF) / (2.0 * THIGH * CALF)
+        square = x * x + down * down
+        bend = (square - upper * upper - lower * lower) / (2.0 * upper * lower)
         # ONNX Runtime has inverse functions of float32 alone, and no arctan2.
         calf = (-th.acos(bend.clamp(-1.0, 1.0).float())).double()
         calf = calf.clamp(self.lowest, self.highest)
-        lean = CALF * th.sin(calf) / (THIGH + CALF * th.cos(calf))
+        lean = lower * th.sin(calf) / (upper + lower * th.cos(calf))
         hip = th.atan(((out * z + down * y) / (out * y - down * z)).float()).double()
         thigh = (th.atan((-x / down).float()) - th.atan(lean.float())).double()
         return th.stack([hip, thigh, calf], 1).flatten()

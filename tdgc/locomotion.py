@@ -16,7 +16,6 @@ from tdgc.commands import INDEX, NUM_COMMANDS, default_command, gait_index, obse
 from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
 from tdgc.gaits import GAITS, PhaseClock, swing_profile
 from tdgc.robot import (
-    FOOT_RADIUS,
     NUM_JOINTS,
     Array,
     commanded_pose,
@@ -122,8 +121,10 @@ class Locomotion:
         self.joint_offset = np.zeros((num_robots, NUM_JOINTS))
         self.friction = np.full(num_robots, physics.friction)
         self.payload = np.zeros(num_robots)
-        feet, _ = foot_kinematics(self.nominal[None], np.zeros((1, NUM_JOINTS)))
-        self._stand = FOOT_RADIUS - feet[0, :, 2].min()  # trunk above the soles, nominal pose
+        geometry = self.world.state.geometry
+        # Feet in the nominal pose, (1, 4, 3) m, and how high the trunk is above their soles.
+        self._feet, _ = foot_kinematics(geometry, self.nominal[None], np.zeros((1, NUM_JOINTS)))
+        self._stand = geometry.foot_radius - self._feet[0, :, 2].min()
         self._pose = self._pose_of = np.empty(0)  # the last ``pose`` and what it followed from
 
     @property
@@ -139,17 +140,18 @@ class Locomotion:
         follows = np.concatenate([self.command, self.clock.phases], axis=1)
         if not np.array_equal(follows, self._pose_of):
             swing = swing_profile(self.clock.phases)
-            self._pose, self._pose_of = commanded_pose(self.robot, self.command, swing), follows
+            geometry = self.world.state.geometry
+            self._pose = commanded_pose(self.robot, geometry, self.command, swing)
+            self._pose_of = follows
             self._pose.setflags(write=False)
         return self._pose
 
     def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:
         """Stand the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)
         rad, with their clocks at ``clock`` (n,), and forget their histories."""
-        feet, _ = foot_kinematics(self.nominal[None], np.zeros((1, NUM_JOINTS)))
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-        foot_x = xy[:, :1] + c * feet[..., 0] - s * feet[..., 1]
-        foot_y = xy[:, 1:] + s * feet[..., 0] + c * feet[..., 1]
+        foot_x = xy[:, :1] + c * self._feet[..., 0] - s * self._feet[..., 1]
+        foot_y = xy[:, 1:] + s * self._feet[..., 0] + c * self._feet[..., 1]
         ground = self.world.ground_height(foot_x, foot_y).max(axis=1)
         position = np.column_stack([xy, ground + self._stand])
         pose = np.tile(self.nominal, (len(index), 1))
@@ -210,7 +212,8 @@ class Locomotion:
 
     def _arrays(self) -> dict[str, Array]:
         """All that one step leaves for the next but what Bullet remembers of contacts."""
-        measured = [f.name for f in dataclasses.fields(self.world.state) if f.init]
+        fields = dataclasses.fields(self.world.state)
+        measured = [f.name for f in fields if f.init and f.name != "geometry"]
         return {
             "command": self.command,
             "actions": self.actions,

@@ -18,7 +18,7 @@ from tdgc.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.config import LowLevelConfig
 from tdgc.gaits import GAITS, gait_embedding, swing_profile
 from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
-from tdgc.robot import HIPS_XY, NUM_JOINTS, Array, wrap_angle
+from tdgc.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.state import State, copies, fill
 from tdgc.terrain import (
     MAX_LEVEL,
@@ -339,7 +339,7 @@ class LowLevelTask:
         world = self.locomotion.world
         state = world.state
         c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
-        points = np.concatenate([_PROBES, HIPS_XY])
+        points = np.concatenate([_PROBES, state.geometry.hips])
         x = state.position[:, :1] + c * points[:, 0] - s * points[:, 1]
         y = state.position[:, 1:2] + s * points[:, 0] + c * points[:, 1]
         n = len(_PROBES)

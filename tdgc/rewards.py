@@ -17,7 +17,8 @@ import numpy as np
 
 from tdgc.commands import INDEX
 from tdgc.config import HighRewardConfig, LowRewardConfig
-from tdgc.robot import FOOT_RADIUS, HIPS_XY, JOINT_LIMITS, Array, RobotState
+from tdgc.geometry import FRONT, SIDE
+from tdgc.robot import Array, RobotState
 
 CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact
 _SOFT_LIMIT = 0.9  # share of a joint's range that costs nothing (Walk These Ways)
@@ -106,7 +107,7 @@ def raibert_targets(command: Array, phases: Array) -> Array:
     half = 0.5 * np.stack(
         [command[:, INDEX["stance_length"]], command[:, INDEX["stance_width"]]], axis=-1
     )
-    rest = half[:, None, :] * np.sign(HIPS_XY)
+    rest = half[:, None, :] * np.stack([FRONT, SIDE], axis=1)
     lead = np.abs(1.0 - 2.0 * phases) - 0.5
     stance_time = command[:, INDEX["duration"]] / command[:, INDEX["frequency"]]
     turn = command[:, INDEX["yaw_rate"], None]
@@ -127,7 +128,7 @@ def raibert_foothold(s: LowStep) -> Array:
 
 def swing_height(s: LowStep) -> Array:
     """Squared error of the feet's height against the swing profile, weighed by 1 - C, m^2."""
-    wanted = s.cmd("swing_height")[:, None] * s.swing + FOOT_RADIUS
+    wanted = s.cmd("swing_height")[:, None] * s.swing + s.state.geometry.foot_radius
     return np.sum((s.foot_height - wanted) ** 2 * (1.0 - s.contact), axis=1)
 
 
@@ -172,8 +173,9 @@ def leg_collision(s: LowStep) -> Array:
 
 def joint_limits(s: LowStep) -> Array:
     """How far joints are beyond 0.9 of their range, summed, rad."""
-    middle = JOINT_LIMITS.mean(axis=1)
-    half = 0.5 * _SOFT_LIMIT * (JOINT_LIMITS[:, 1] - JOINT_LIMITS[:, 0])
+    limits = s.state.geometry.joint_limits
+    middle = limits.mean(axis=1)
+    half = 0.5 * _SOFT_LIMIT * (limits[:, 1] - limits[:, 0])
     return np.sum(np.maximum(np.abs(s.state.q - middle) - half, 0.0), axis=1)
 
 

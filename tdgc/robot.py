@@ -1,4 +1,4 @@
-"""The robot on arrays: joint order, nominal pose, joint PD, leg kinematics and the state.
+"""The robot on arrays: nominal pose, joint PD, leg kinematics and the state.
 
 Plain numpy; ``tdgc.world`` fills a ``RobotState`` from Bullet and asks ``pd_torque`` for torques.
 Every array has a leading axis of M robots. Legs in the order of ``tdgc.gaits.FEET``.
@@ -8,59 +8,29 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.commands import INDEX, default_command
-from tdgc.config import ConfigError, RobotConfig
-from tdgc.gaits import FEET
+from tdgc.config import RobotConfig
+from tdgc.geometry import FRONT, JOINTS, SIDE, Geometry
 
 Array = NDArray[np.float64]
 
-JOINTS = tuple(f"{leg}_{part}_joint" for leg in FEET for part in ("hip", "thigh", "calf"))
 NUM_JOINTS = len(JOINTS)
 
-# Geometry of urdf/quadruped.urdf (a test compares it with Bullet's own link poses).
-HIP_X = 0.183  # m, hip joint ahead of the trunk's centre
-HIP_Y = 0.047  # m, and to the side
-ABDUCTION = 0.08  # m, from the hip joint out to the thigh joint
-THIGH = 0.213  # m
-CALF = 0.213  # m
-FOOT_RADIUS = 0.022  # m
 HIGHEST_FOOT = -0.1  # m against the hips: no commanded pose folds a leg further
-TRUNK_MASS = 5.6  # kg
-#: Joint limits in rad, (12, 2), as in the URDF.
-JOINT_LIMITS: Array = np.tile([[-0.86, 0.86], [-0.69, 4.5], [-2.82, -0.89]], (4, 1))
-
-_SIDE = np.array([1.0, -1.0, 1.0, -1.0])  # left +, right -
-_FRONT = np.array([1.0, 1.0, -1.0, -1.0])
-#: Hip joints in the trunk's frame, (4, 2).
-HIPS_XY: Array = np.stack([HIP_X * _FRONT, HIP_Y * _SIDE], axis=1)
-
-
-def urdf_path(config: RobotConfig) -> Path:
-    """Absolute path of the robot's URDF: as given, or relative to the repository.
-
-    Raises:
-        ConfigError: no such file.
-    """
-    given = Path(config.urdf)
-    for path in (given, Path(__file__).resolve().parent.parent / given):
-        if path.is_file():
-            return path.resolve()
-    raise ConfigError(f"robot.urdf: no file '{config.urdf}' here or in the repository")
 
 
 def nominal_pose(config: RobotConfig) -> Array:
     """q0 of the paper, (12,) rad."""
     front, rear = config.nominal_thigh
-    thigh = np.where(_FRONT > 0, front, rear)
-    return np.stack([config.nominal_hip * _SIDE, thigh, np.full(4, config.nominal_calf)], 1).ravel()
+    thigh = np.where(FRONT > 0, front, rear)
+    return np.stack([config.nominal_hip * SIDE, thigh, np.full(4, config.nominal_calf)], 1).ravel()
 
 
-def commanded_pose(config: RobotConfig, command: Array, swing: Array) -> Array:
+def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swing: Array) -> Array:
     """q0(c, phi): the nominal pose bent to the commanded behaviour, (M, 15), (M, 4) -> (M, 12) rad.
 
     The feet stand under a level trunk of the commanded height, as wide and long apart as asked, and
@@ -70,15 +40,15 @@ def commanded_pose(config: RobotConfig, command: Array, swing: Array) -> Array:
     start from, not a constraint: a foot out of reach is put at the nearest angles that the calf
     has, and none comes higher than ``HIGHEST_FOOT``.
     """
-    standing = foot_kinematics(nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))[0]
+    standing, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
     change = command - default_command()
     feet = np.repeat(standing, len(command), axis=0)
-    feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * _FRONT
-    feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * _SIDE
+    feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * FRONT
+    feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * SIDE
     feet[..., 2] -= change[:, INDEX["body_height"], None]
     feet[..., 2] += change[:, INDEX["swing_height"], None] * swing
     feet[..., 2] = np.minimum(feet[..., 2], HIGHEST_FOOT)
-    return leg_angles(feet)
+    return leg_angles(geometry, feet)
 
 
 def joint_targets(config: RobotConfig, pose: Array, actions: Array) -> Array:
@@ -115,40 +85,42 @@ def pd_torque(error: Array, speed: Array, strength: Array, config: RobotConfig) 
     return torque
 
 
-def foot_kinematics(q: Array, qd: Array) -> tuple[Array, Array]:
+def foot_kinematics(geometry: Geometry, q: Array, qd: Array) -> tuple[Array, Array]:
     """Foot centres and velocities in the trunk's frame: (M, 12) twice -> (M, 4, 3) twice."""
     angle, rate = q.reshape(-1, 4, 3), qd.reshape(-1, 4, 3)
     hip, thigh, knee = angle[..., 0], angle[..., 1], angle[..., 1] + angle[..., 2]
     hip_d, thigh_d, knee_d = rate[..., 0], rate[..., 1], rate[..., 1] + rate[..., 2]
-    st, ct = THIGH * np.sin(thigh), THIGH * np.cos(thigh)
-    sk, ck = CALF * np.sin(knee), CALF * np.cos(knee)
+    st, ct = geometry.thigh * np.sin(thigh), geometry.thigh * np.cos(thigh)
+    sk, ck = geometry.calf * np.sin(knee), geometry.calf * np.cos(knee)
     x, down = -st - sk, -ct - ck
     x_d, down_d = -ct * thigh_d - ck * knee_d, st * thigh_d + sk * knee_d
     sh, ch = np.sin(hip), np.cos(hip)
-    out = ABDUCTION * _SIDE
+    out = geometry.abduction * SIDE
     y, z = out * ch - down * sh, out * sh + down * ch
-    position = np.stack([x + HIPS_XY[:, 0], y + HIPS_XY[:, 1], z], axis=-1)
+    position = np.stack([x + geometry.hips[:, 0], y + geometry.hips[:, 1], z], axis=-1)
     velocity = np.stack([x_d, -z * hip_d - down_d * sh, y * hip_d + down_d * ch], axis=-1)
     return position, velocity
 
 
-def leg_angles(feet: Array) -> Array:
+def leg_angles(geometry: Geometry, feet: Array) -> Array:
     """Joint angles that put the foot centres there, the inverse of ``foot_kinematics``.
 
     Args:
+        geometry: the robot's.
         feet: (M, 4, 3) m in the trunk's frame, below the hips.
 
     Returns:
-        (M, 12) rad, the calf within its limits: a leg too short or too long points at its foot.
+        (M, 12) rad, each calf within its limits: a leg too short or too long points at its foot.
     """
-    x, y, z = np.moveaxis(feet - np.pad(HIPS_XY, ((0, 0), (0, 1))), -1, 0)
-    out = ABDUCTION * _SIDE
+    upper, lower = geometry.thigh, geometry.calf
+    x, y, z = np.moveaxis(feet - np.pad(geometry.hips, ((0, 0), (0, 1))), -1, 0)
+    out = geometry.abduction * SIDE
     down = np.sqrt(np.maximum(y * y + z * z - out * out, 0.0))  # below the thigh joint, hip at 0
     hip = wrap_angle(np.arctan2(z, y) - np.arctan2(-down, out))
     square = x * x + down * down
-    bend = (square - THIGH * THIGH - CALF * CALF) / (2.0 * THIGH * CALF)
-    calf = np.clip(-np.arccos(np.clip(bend, -1.0, 1.0)), *JOINT_LIMITS[2])
-    lean = np.arctan2(CALF * np.sin(calf), THIGH + CALF * np.cos(calf))
+    bend = (square - upper * upper - lower * lower) / (2.0 * upper * lower)
+    calf = np.clip(-np.arccos(np.clip(bend, -1.0, 1.0)), *geometry.joint_limits[2::3].T)
+    lean = np.arctan2(lower * np.sin(calf), upper + lower * np.cos(calf))
     thigh = np.arctan2(-x, down) - lean
     return np.stack([hip, thigh, calf], axis=-1).reshape(len(feet), NUM_JOINTS)
 
@@ -180,6 +152,7 @@ class RobotState:
     """What Bullet says about M robots after a control step, and what follows from it.
 
     Attributes:
+        geometry: the robots'.
         position, quaternion: trunk in the world, (M, 3) m and (M, 4).
         lin_vel, ang_vel: trunk in the world, (M, 3) m/s and rad/s.
         q, qd, torque: joints, (M, 12) rad, rad/s and N m (torque of the last physics step).
@@ -188,6 +161,7 @@ class RobotState:
         trunk_force: largest normal force on the trunk in any physics step, (M,) N.
     """
 
+    geometry: Geometry
     position: Array
     quaternion: Array
     lin_vel: Array
@@ -207,14 +181,15 @@ class RobotState:
     foot_velocity: Array = field(init=False)
 
     @classmethod
-    def zeros(cls, num_robots: int) -> RobotState:
+    def zeros(cls, geometry: Geometry, num_robots: int) -> RobotState:
         """A state of ``num_robots`` upright robots at the origin."""
         m = num_robots
         quaternion = np.zeros((m, 4))
         quaternion[:, 3] = 1.0
         arrays = [np.zeros((m, n)) for n in (3, 3, 12, 12, 12, 4, 4)]
         lin, ang, q, qd, torque, foot, leg = arrays
-        state = cls(np.zeros((m, 3)), quaternion, lin, ang, q, qd, torque, foot, leg, np.zeros(m))
+        trunk = np.zeros((m, 3)), quaternion, lin, ang
+        state = cls(geometry, *trunk, q, qd, torque, foot, leg, np.zeros(m))
         state.derive()
         return state
 
@@ -232,7 +207,7 @@ class RobotState:
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         vx, vy, vz = self.lin_vel.T
         self.heading_vel = np.stack([c * vx + s * vy, c * vy - s * vx, vz], axis=-1)
-        self.foot_body, foot_vel = foot_kinematics(self.q, self.qd)
+        self.foot_body, foot_vel = foot_kinematics(self.geometry, self.q, self.qd)
         turned = self.rotation[:, None]
         arm = (turned @ self.foot_body[..., None])[..., 0]
         self.foot_position = self.position[:, None] + arm

@@ -20,17 +20,9 @@ import numpy as np
 import pybullet
 from numpy.typing import ArrayLike, NDArray
 
-from tdgc.config import PhysicsConfig, RobotConfig
-from tdgc.robot import (
-    FOOT_RADIUS,
-    JOINTS,
-    NUM_JOINTS,
-    TRUNK_MASS,
-    Array,
-    RobotState,
-    pd_torque,
-    urdf_path,
-)
+from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
+from tdgc.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.robot import NUM_JOINTS, Array, RobotState, pd_torque
 from tdgc.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
 
 _GROUND, _ROBOT = 1, 2  # collision groups: robots meet the ground and nothing else
@@ -74,6 +66,9 @@ class World:
     robots' part of the field only. ``visual`` keeps what is needed for pictures, ``window`` shows
     all in Bullet's own window.
 
+    Raises:
+        ConfigError: the robot's URDF is not there or no robot that this package can drive.
+
     Attributes:
         state: the ``RobotState`` after the last step, push or reset.
         strength: (M, 1) motor strength, times gains and torque limits.
@@ -98,7 +93,7 @@ class World:
         self._visual = visual
         self.strength = np.ones((num_robots, 1))
         self.bullet_seconds = 0.0
-        self.state = RobotState.zeros(num_robots)
+        self.state = RobotState.zeros(read_geometry(robot), num_robots)
         self._clients: list[_Client] = []
         self._bodies: list[int] = []
         self._client_of: list[_Client] = []
@@ -191,18 +186,19 @@ class World:
 
     def _load_robot(self, client: _Client, place: int) -> int:
         # Apart and high, so that nothing touches before the first reset.
-        body = client.loadURDF(
-            str(urdf_path(self.robot)),
-            basePosition=[2.0 * place, 0.0, _PARKED],
-            flags=pybullet.URDF_USE_INERTIA_FROM_FILE
-            | (0 if self._visual else pybullet.URDF_IGNORE_VISUAL_SHAPES),
-        )
+        path = urdf_path(self.robot)
+        try:
+            body = client.loadURDF(
+                str(path),
+                basePosition=[2.0 * place, 0.0, _PARKED],
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE
+                | (0 if self._visual else pybullet.URDF_IGNORE_VISUAL_SHAPES),
+            )
+        except pybullet.error as error:  # a mesh that is not there, an element it cannot read
+            raise ConfigError(f"{path}: Bullet cannot load it and says why above") from error
         found = {
             client.getJointInfo(body, j)[1].decode(): j for j in range(client.getNumJoints(body))
         }
-        missing = [name for name in JOINTS if name not in found]
-        if missing:
-            raise ValueError(f"{self.robot.urdf} lacks the joints {', '.join(missing)}")
         self._joints = [found[name] for name in JOINTS]
         self._leg_of_link = {j: i // 3 for i, j in enumerate(self._joints)}
         self._calf_links = {self._joints[3 * leg + 2] for leg in range(4)}
@@ -271,9 +267,10 @@ class World:
 
     def set_dynamics(self, index: ArrayLike, friction: Array, payload: Array) -> None:
         """Friction of every link and extra mass of the trunk, (n,) and (n,) kg."""
+        nominal = self.state.geometry.trunk_mass
         for k, i in enumerate(np.asarray(index)):
             body, client = self._bodies[i], self._client_of[i]
-            mass = TRUNK_MASS + float(payload[k])
+            mass = nominal + float(payload[k])
             for link in range(-1, NUM_JOINTS):
                 client.changeDynamics(body, link, lateralFriction=float(friction[k]))
             # Spread over the trunk, the payload scales its inertia.
@@ -281,7 +278,7 @@ class World:
                 body,
                 -1,
                 mass=mass,
-                localInertiaDiagonal=(self._trunk_inertia * (mass / TRUNK_MASS)).tolist(),
+                localInertiaDiagonal=(self._trunk_inertia * (mass / nominal)).tolist(),
             )
 
     def push(self, index: ArrayLike, velocity: Array) -> None:
@@ -366,7 +363,7 @@ class World:
         feet = self.state.foot_position.tolist()
         foot_force = [[0.0] * 4 for _ in range(self.num_robots)]
         leg_force = [[0.0] * 4 for _ in range(self.num_robots)]
-        reach = (FOOT_RADIUS + _FOOT_REACH) ** 2
+        reach = (self.state.geometry.foot_radius + _FOOT_REACH) ** 2
         for client in self._clients:
             for contact in client.getContactPoints(bodyA=client.ground):
                 force, link = contact[9], contact[4]

@@ -20,6 +20,8 @@ from tdgc.locomotion import Locomotion
 from tdgc.robot import Array
 from tdgc.trace import COLUMNS, Trace, Tracer
 
+HIPS = 0.183  # m, of the shipped robot
+
 
 @pytest.fixture(scope="module")
 def low():
@@ -43,7 +45,7 @@ def blamed(driver: HierarchyDriver, low: Any, cells: list[tuple[str, int, int]])
         tracer = Tracer(driver, SEED)
         run_cell(Cell("tdgc", "nominal", family, level, 0, count), low, driver, SEED, tracer)
         failures = [t for t in tracer.traces() if t.outcome != "reached"]
-        layers += [diagnose(t).layer for t in failures]
+        layers += [diagnose(t, HIPS).layer for t in failures]
     return layers
 
 
@@ -132,7 +134,7 @@ def walk(
 
 
 def verdict(trace: Trace) -> tuple[str, str]:
-    found = diagnose(trace)
+    found = diagnose(trace, HIPS)
     return found.layer, found.cause
 
 
@@ -169,7 +171,7 @@ def test_speeding_up_from_rest_does_not_count():
     start = walk(seconds=1.5)
     start["error_vx"][1:11] = -1.0
     assert verdict(start)[0] == "decisions"
-    short = diagnose(walk(seconds=0.8, error_vx=-1.0))
+    short = diagnose(walk(seconds=0.8, error_vx=-1.0), HIPS)
     assert short.layer == "decisions" and "tracking not judged" in short.evidence
 
 
@@ -191,7 +193,7 @@ def pillar_at() -> tuple[float, float]:
 def test_a_pillar_in_the_way_is_the_decisions_fault():
     x, y = pillar_at()
     into = ((x - 1.0, y), (x - 0.25, y))
-    hit = diagnose(walk("pillar", outcome="collided", track=into))
+    hit = diagnose(walk("pillar", outcome="collided", track=into), HIPS)
     assert (hit.layer, hit.cause) == ("decisions", "steered into a pillar")
     assert hit.feature == f"0.25 m from pillar at ({x:.1f}, {y:.1f}) m"
     # Pushing against it, the robot tracks nothing; that tells nothing of the low level.
@@ -212,11 +214,11 @@ def test_tipping_over_the_edge_does_not_count():
 
 def test_an_episode_that_succeeded_has_no_diagnosis():
     with pytest.raises(ValueError, match="has not failed"):
-        diagnose(walk(outcome="reached"))
+        diagnose(walk(outcome="reached"), HIPS)
 
 
 def test_evidence_gives_the_numbers():
-    found = diagnose(walk(error_vx=0.3, error_vy=0.4, at_bound_yaw_rate=-1.0))
+    found = diagnose(walk(error_vx=0.3, error_vy=0.4, at_bound_yaw_rate=-1.0), HIPS)
     assert found.evidence == (
         "in the last 2 s: velocity off by 0.50 m/s (limit 0.24); yaw rate off by 0.00 rad/s "
         "(limit 0.2); tilt off by 0.00 rad (limit 0.33); asked for +0.50 m/s towards the goal; "
@@ -275,7 +277,7 @@ def test_mixed_tiles_have_the_features_of_both_halves():
 
 def test_rows_are_written_as_they_are(tmp_path: Path):
     path = tmp_path / "diagnosis.csv"
-    rows = [diagnose(walk()), diagnose(walk("gap", outcome="fell"))]
+    rows = [diagnose(walk(), HIPS), diagnose(walk("gap", outcome="fell"), HIPS)]
     diagnosis.write(rows, path)
     with open(path, newline="", encoding="utf-8") as file:
         read = list(csv.DictReader(file))
@@ -294,8 +296,8 @@ def test_summary_says_where_most_is_to_be_won():
     episodes = [episode("stair", "fell")] * 3 + [episode("rough", "left_tile")] * 2
     episodes += [episode("stair", "left_tile")] + [episode("rough", "reached")] * 4
     episodes += [episode("rough", "reached", "gp")]
-    rows = [diagnose(walk("stair", outcome="fell"))] * 3 + [diagnose(walk("rough"))] * 2
-    rows.append(diagnose(walk("stair")))
+    rows = [diagnose(walk("stair", outcome="fell"), HIPS)] * 3 + [diagnose(walk("rough"), HIPS)] * 2
+    rows.append(diagnose(walk("stair"), HIPS))
     lines = describe(rows, episodes).splitlines()
     assert lines[0] == "failures of tdgc, nominal: 6 of 10 episodes"
     assert lines[2].split() == "stair 6 1 3 0 lost its footing on the way to the goal (3)".split()

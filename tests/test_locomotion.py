@@ -19,7 +19,7 @@ from tdgc.locomotion import (
     action_mirror,
 )
 from tdgc.low_env import CRITIC_LAYOUT, LowLevelTask
-from tdgc.robot import FOOT_RADIUS, Array, commanded_pose, nominal_pose
+from tdgc.robot import Array, commanded_pose, nominal_pose
 from tdgc.terrain import TILE_SIZE, Tile, make_tile
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig(substeps=4)
@@ -174,7 +174,9 @@ def test_the_pose_is_never_stale(loco: Locomotion) -> None:
     """Whatever it follows from is changed in place or by a step: it is as derived anew."""
 
     def fresh() -> Array:
-        return commanded_pose(ROBOT, loco.command, swing_profile(loco.clock.phases))
+        return commanded_pose(
+            ROBOT, loco.world.state.geometry, loco.command, swing_profile(loco.clock.phases)
+        )
 
     loco.clock.reset(np.arange(2), np.array([0.1, 0.35]))
     seen, earlier = [], loco.state_dict()
@@ -212,7 +214,7 @@ def test_place_stands_robots_on_the_ground_and_forgets(loco: Locomotion) -> None
     other = loco.observe()[0]
     loco.place(np.array([1]), np.array([[3.0, -2.0]]), np.array([1.2]), np.array([0.75]))
     state = loco.world.state
-    np.testing.assert_allclose(state.foot_position[1, :, 2].min(), FOOT_RADIUS, atol=1e-12)
+    np.testing.assert_allclose(state.foot_position[1, :, 2].min(), 0.022, atol=1e-12)
     np.testing.assert_allclose(state.position[1, :2], [3.0, -2.0], atol=1e-12)
     assert state.yaw[1] == pytest.approx(1.2)
     assert (state.q[1] == NOMINAL).all() and (state.qd[1] == 0.0).all()

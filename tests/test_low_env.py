@@ -16,6 +16,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 import tdgc.low_env as low_env
 from tdgc.commands import INDEX, default_command, gait_index
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
+from tdgc.geometry import read_geometry
 from tdgc.low_env import (
     CRITIC_LAYOUT,
     LowLevelEnv,
@@ -25,7 +26,7 @@ from tdgc.low_env import (
     straddling_frequency,
     summarise,
 )
-from tdgc.robot import FOOT_RADIUS, Array, RobotState, nominal_pose, yaw_quaternion
+from tdgc.robot import Array, RobotState, nominal_pose, yaw_quaternion
 from tdgc.state import State, split
 from tdgc.terrain import make_tile, tile_rng
 
@@ -254,7 +255,7 @@ class Ground:
     """A world of states only: the ground is 1 m high."""
 
     def __init__(self, heights: list[float], forces: list[float]) -> None:
-        self.state = RobotState.zeros(len(heights))
+        self.state = RobotState.zeros(read_geometry(RobotConfig()), len(heights))
         self.state.position[:, 2] = heights
         self.state.trunk_force[:] = forces
 
@@ -593,7 +594,7 @@ def test_a_new_level_is_a_new_tile() -> None:
         task.step(still(task))
     state = task.locomotion.world.state
     assert (state.foot_force[1] > 1.0).any()
-    assert state.foot_position[1, :, 2].min() == pytest.approx(0.8 + FOOT_RADIUS, abs=5e-3)
+    assert state.foot_position[1, :, 2].min() == pytest.approx(0.8 + 0.022, abs=5e-3)
     task.close()
 
 

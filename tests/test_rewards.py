@@ -11,31 +11,25 @@ from tdgc import rewards
 from tdgc.commands import INDEX, default_command
 from tdgc.config import HighRewardConfig, LowRewardConfig, RobotConfig
 from tdgc.gaits import desired_contact, gait_embedding, swing_profile
+from tdgc.geometry import read_geometry
 from tdgc.rewards import HIGH_TERMS, LOW_TERMS, HighStep, LowStep, high_terms, low_terms, total
-from tdgc.robot import (
-    FOOT_RADIUS,
-    HIPS_XY,
-    JOINT_LIMITS,
-    Array,
-    RobotState,
-    foot_kinematics,
-    nominal_pose,
-)
+from tdgc.robot import Array, RobotState, foot_kinematics, nominal_pose
 
 E = math.exp
+GEOMETRY = read_geometry(RobotConfig())
 
 
 def low_step(**changes: object) -> LowStep:
     """Two robots that stand still, upright, with straight legs; mid-stance everywhere."""
     phases = np.full((2, 4), 0.25)
     step = LowStep(
-        state=RobotState.zeros(2),
+        state=RobotState.zeros(GEOMETRY, 2),
         command=np.tile(default_command(), (2, 1)),
         phases=phases,
         contact=np.ones((2, 4)),
         swing=np.zeros((2, 4)),
         base_height=np.full(2, 0.30),
-        foot_height=np.full((2, 4), FOOT_RADIUS),
+        foot_height=np.full((2, 4), GEOMETRY.foot_radius),
         standing_height=0.30,
         targets=np.zeros((3, 2, 12)),
         actions=np.zeros((2, 2, 12)),
@@ -155,7 +149,7 @@ def test_raibert_rests_under_the_commanded_rectangle() -> None:
     np.testing.assert_allclose(raibert(0.0), RECTANGLE, atol=1e-12)
     np.testing.assert_allclose(raibert(0.25, vx=1.0, vy=0.5), RECTANGLE, atol=1e-12)
     wide = raibert(0.7, stance_width=0.35, stance_length=0.33)
-    np.testing.assert_allclose(wide, np.sign(HIPS_XY) * [0.165, 0.175], atol=1e-12)
+    np.testing.assert_allclose(wide, np.sign(GEOMETRY.hips) * [0.165, 0.175], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +196,7 @@ def test_raibert_error_is_measured_in_the_heading_frame() -> None:
     step.state.q[:] = pose
     step.state.position[:] = [[3.0, -2.0, 0.3]] * 2
     turn(step, 0.0, 0.0, 2.2)
-    expected, _ = foot_kinematics(pose[None], np.zeros((1, 12)))
+    expected, _ = foot_kinematics(GEOMETRY, pose[None], np.zeros((1, 12)))
     error = ((expected[0, :, :2] - RECTANGLE) ** 2).sum()
     np.testing.assert_allclose(rewards.raibert_foothold(step), [error, error], atol=1e-9)
     # Mid-stance velocity asks for nothing; at touch-down the targets lead by 0.0833 m.
@@ -216,7 +210,7 @@ def test_raibert_error_is_measured_in_the_heading_frame() -> None:
 def test_swing_height() -> None:
     """Robot 1: FL at mid-swing 0.01 m too low, FR half way up as it should be, rear in stance."""
     phases = np.array([[0.25] * 4, [0.75, 7.0 / 12.0, 0.25, 0.25]])  # half a sine: 1 and 1/2
-    heights = np.full((2, 4), FOOT_RADIUS)
+    heights = np.full((2, 4), GEOMETRY.foot_radius)
     heights[1, 0] += 0.07
     heights[1, 1] += 0.04
     step = low_step(
@@ -278,7 +272,7 @@ def test_target_and_action_differences() -> None:
 
 def test_joint_limits_cost_beyond_nine_tenths_of_the_range() -> None:
     step = low_step()
-    low, high = JOINT_LIMITS.T
+    low, high = GEOMETRY.joint_limits.T
     step.state.q[0] = (low + high) / 2 + 0.45 * (high - low)  # on the edge
     step.state.q[1] = (low + high) / 2
     step.state.q[1, 0], step.state.q[1, 1] = high[0], low[1] - 0.1
@@ -354,7 +348,7 @@ def test_total_groups_by_the_sign_of_the_weight() -> None:
 
 def test_a_perfect_step_earns_the_most_there_is() -> None:
     step = low_step()
-    step.state.q[:] = JOINT_LIMITS.mean(axis=1)
+    step.state.q[:] = GEOMETRY.joint_limits.mean(axis=1)
     step.state.derive()
     weights = LowRewardConfig(raibert_foothold=0.0)
     best = total(low_terms(step, weights), weights, 0.02)

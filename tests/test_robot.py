@@ -4,7 +4,6 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,20 +11,11 @@ import pybullet
 import pytest
 
 from tdgc.commands import INDEX, default_command
-from tdgc.config import ConfigError, RobotConfig
+from tdgc.config import RobotConfig
 from tdgc.gaits import FEET
+from tdgc.geometry import JOINTS, read_geometry, urdf_path
 from tdgc.robot import (
-    ABDUCTION,
-    CALF,
-    FOOT_RADIUS,
     HIGHEST_FOOT,
-    HIP_X,
-    HIP_Y,
-    HIPS_XY,
-    JOINT_LIMITS,
-    JOINTS,
-    THIGH,
-    TRUNK_MASS,
     Array,
     RobotState,
     commanded_pose,
@@ -35,13 +25,14 @@ from tdgc.robot import (
     nominal_pose,
     pd_torque,
     rotation_matrix,
-    urdf_path,
     wrap_angle,
     yaw_quaternion,
 )
 
 CONFIG = RobotConfig()
-URDF = urdf_path(CONFIG)
+URDF, GEOMETRY = urdf_path(CONFIG), read_geometry(CONFIG)
+# The shipped robot in m; what is read from its URDF is compared with these in test_geometry.
+HIP_X, HIP_Y, ABDUCTION, THIGH, CALF, FOOT_RADIUS = 0.183, 0.047, 0.08, 0.213, 0.213, 0.022
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Array:
@@ -92,11 +83,11 @@ def body() -> Iterator[Body]:
 
 def random_state(seed: int) -> RobotState:
     rng = np.random.default_rng(seed)
-    state = RobotState.zeros(1)
+    state = RobotState.zeros(GEOMETRY, 1)
     state.position[0] = rng.uniform(-2.0, 2.0, 3)
     state.quaternion = quaternion(*rng.uniform(-1.5, 1.5, 3))
     state.lin_vel, state.ang_vel = rng.uniform(-2, 2, (1, 3)), rng.uniform(-5, 5, (1, 3))
-    state.q = rng.uniform(*JOINT_LIMITS.T)[None]
+    state.q = rng.uniform(*GEOMETRY.joint_limits.T)[None]
     state.qd = rng.uniform(-15.0, 15.0, (1, 12))
     state.derive()
     return state
@@ -126,14 +117,14 @@ def test_rotation_yaw_and_gravity_are_bullets(seed: int) -> None:
 def test_foot_velocity_is_the_derivative_of_the_position() -> None:
     rng = np.random.default_rng(3)
     q, qd, step = rng.uniform(-1, 1, (6, 12)), rng.uniform(-10, 10, (6, 12)), 1e-6
-    ahead, _ = foot_kinematics(q + step * qd, qd)
-    behind, _ = foot_kinematics(q - step * qd, qd)
-    _, velocity = foot_kinematics(q, qd)
+    ahead, _ = foot_kinematics(GEOMETRY, q + step * qd, qd)
+    behind, _ = foot_kinematics(GEOMETRY, q - step * qd, qd)
+    _, velocity = foot_kinematics(GEOMETRY, q, qd)
     np.testing.assert_allclose(velocity, (ahead - behind) / (2 * step), atol=1e-7)
 
 
 def test_legs_straight_down() -> None:
-    feet, velocity = foot_kinematics(np.zeros((1, 12)), np.zeros((1, 12)))
+    feet, velocity = foot_kinematics(GEOMETRY, np.zeros((1, 12)), np.zeros((1, 12)))
     expected = [[0.183, 0.127, -0.426], [0.183, -0.127, -0.426],
                 [-0.183, 0.127, -0.426], [-0.183, -0.127, -0.426]]  # fmt: skip
     np.testing.assert_allclose(feet[0], expected, atol=1e-12)
@@ -144,16 +135,18 @@ def test_signs_of_the_joints() -> None:
     """A positive thigh swings the foot back, a positive hip swings every foot to the left."""
     thigh, hip = np.zeros((1, 12)), np.zeros((1, 12))
     thigh[0, 1::3], hip[0, 0::3] = 0.3, 0.3
-    feet, _ = foot_kinematics(thigh, np.zeros((1, 12)))
-    np.testing.assert_allclose(feet[0, :, 0], HIPS_XY[:, 0] - 0.426 * math.sin(0.3), atol=1e-12)
-    feet, _ = foot_kinematics(hip, np.zeros((1, 12)))
+    feet, _ = foot_kinematics(GEOMETRY, thigh, np.zeros((1, 12)))
+    np.testing.assert_allclose(
+        feet[0, :, 0], GEOMETRY.hips[:, 0] - 0.426 * math.sin(0.3), atol=1e-12
+    )
+    feet, _ = foot_kinematics(GEOMETRY, hip, np.zeros((1, 12)))
     out = np.array([1.0, -1.0, 1.0, -1.0]) * 0.08 * math.cos(0.3) + 0.426 * math.sin(0.3)
-    np.testing.assert_allclose(feet[0, :, 1], HIPS_XY[:, 1] + out, atol=1e-12)
+    np.testing.assert_allclose(feet[0, :, 1], GEOMETRY.hips[:, 1] + out, atol=1e-12)
 
 
 def test_state_in_the_heading_frame() -> None:
     """Facing left (+y), nose down: moving along +y is forward, along +x is to the right."""
-    state = RobotState.zeros(1)
+    state = RobotState.zeros(GEOMETRY, 1)
     state.quaternion = quaternion(0.0, 0.2, math.pi / 2)
     state.lin_vel[0] = [0.3, 1.0, -0.2]
     state.derive()
@@ -163,7 +156,7 @@ def test_state_in_the_heading_frame() -> None:
 
 
 def test_zero_state_stands_upright_at_the_origin() -> None:
-    state = RobotState.zeros(2)
+    state = RobotState.zeros(GEOMETRY, 2)
     assert state.gravity.tolist() == [[0.0, 0.0, -1.0]] * 2
     assert state.foot_position.shape == (2, 4, 3) and state.trunk_force.shape == (2,)
     np.testing.assert_allclose(state.foot_position[1, 3], [-0.183, -0.127, -0.426], atol=1e-12)
@@ -197,7 +190,7 @@ def test_nominal_pose() -> None:
 
 
 def test_nominal_pose_stands_at_about_the_stated_height() -> None:
-    feet, _ = foot_kinematics(nominal_pose(CONFIG)[None], np.zeros((1, 12)))
+    feet, _ = foot_kinematics(GEOMETRY, nominal_pose(CONFIG)[None], np.zeros((1, 12)))
     height = FOOT_RADIUS - feet[0, :, 2]
     np.testing.assert_allclose(height, CONFIG.base_height, atol=0.035)
 
@@ -223,16 +216,18 @@ def commands(n: int, **changed: float) -> Array:
 def test_leg_angles_invert_the_kinematics() -> None:
     rng = np.random.default_rng(0)
     q = nominal_pose(CONFIG) + rng.uniform(-0.5, 0.5, (200, 12))
-    feet, _ = foot_kinematics(q, np.zeros_like(q))
-    np.testing.assert_allclose(leg_angles(feet), q, atol=1e-12)
+    feet, _ = foot_kinematics(GEOMETRY, q, np.zeros_like(q))
+    np.testing.assert_allclose(leg_angles(GEOMETRY, feet), q, atol=1e-12)
 
 
 def test_leg_angles_point_at_feet_out_of_reach() -> None:
-    side = np.sign(HIPS_XY[:, 1])
-    under = np.column_stack([HIPS_XY[:, 0], HIPS_XY[:, 1] + ABDUCTION * side, np.full(4, -0.6)])
-    angles = leg_angles(under[None])
+    side = np.sign(GEOMETRY.hips[:, 1])
+    under = np.column_stack(
+        [GEOMETRY.hips[:, 0], GEOMETRY.hips[:, 1] + ABDUCTION * side, np.full(4, -0.6)]
+    )
+    angles = leg_angles(GEOMETRY, under[None])
     np.testing.assert_allclose(angles.reshape(4, 3)[:, 2], -0.89)
-    reached, _ = foot_kinematics(angles, np.zeros((1, 12)))
+    reached, _ = foot_kinematics(GEOMETRY, angles, np.zeros((1, 12)))
     length = math.sqrt(THIGH**2 + CALF**2 + 2.0 * THIGH * CALF * math.cos(0.89))
     under[:, 2] = -length
     np.testing.assert_allclose(reached[0], under, atol=1e-12)
@@ -240,18 +235,18 @@ def test_leg_angles_point_at_feet_out_of_reach() -> None:
 
 def test_commanded_pose_is_the_papers_at_default_commands() -> None:
     swing = np.random.default_rng(0).uniform(size=(5, 4))
-    pose = commanded_pose(CONFIG, commands(5, vx=0.7, pitch=0.2, frequency=2.0), swing)
+    pose = commanded_pose(CONFIG, GEOMETRY, commands(5, vx=0.7, pitch=0.2, frequency=2.0), swing)
     np.testing.assert_allclose(pose, np.tile(nominal_pose(CONFIG), (5, 1)), atol=1e-12)
 
 
 def test_commanded_pose_puts_feet_where_commands_say() -> None:
-    rest, _ = foot_kinematics(nominal_pose(CONFIG)[None], np.zeros((1, 12)))
+    rest, _ = foot_kinematics(GEOMETRY, nominal_pose(CONFIG)[None], np.zeros((1, 12)))
     swing = np.array([[1.0, 0.0, 0.5, 0.0]])
     command = commands(
         1, body_height=-0.05, stance_width=0.31, stance_length=0.40, swing_height=0.18
     )
-    pose = commanded_pose(CONFIG, command, swing)
-    feet, _ = foot_kinematics(pose, np.zeros((1, 12)))
+    pose = commanded_pose(CONFIG, GEOMETRY, command, swing)
+    feet, _ = foot_kinematics(GEOMETRY, pose, np.zeros((1, 12)))
     moved = (feet - rest)[0]
     np.testing.assert_allclose(moved[:, 0], [0.01, 0.01, -0.01, -0.01], atol=1e-9)
     np.testing.assert_allclose(moved[:, 1], [0.03, -0.03, 0.03, -0.03], atol=1e-9)
@@ -260,8 +255,8 @@ def test_commanded_pose_puts_feet_where_commands_say() -> None:
 
 def test_commanded_pose_folds_no_leg_further_than_its_limit() -> None:
     command = commands(1, body_height=-0.1, swing_height=0.20)
-    pose = commanded_pose(CONFIG, command, np.ones((1, 4)))
-    feet, _ = foot_kinematics(pose, np.zeros((1, 12)))
+    pose = commanded_pose(CONFIG, GEOMETRY, command, np.ones((1, 4)))
+    feet, _ = foot_kinematics(GEOMETRY, pose, np.zeros((1, 12)))
     np.testing.assert_allclose(feet[0, :, 2], HIGHEST_FOOT, atol=1e-9)
 
 
@@ -322,7 +317,7 @@ def test_links_and_mass() -> None:
     legs = {f"{leg}_{part}" for leg in FEET for part in ("hip", "thigh", "calf")}
     assert set(LINKS) == {"trunk", *legs}
     mass = {name: float(find(link, "inertial/mass")["value"]) for name, link in LINKS.items()}
-    assert mass["trunk"] == TRUNK_MASS
+    assert mass["trunk"] == 5.6
     assert 12.0 <= sum(mass.values()) <= 13.0
     assert sum(mass.values()) == pytest.approx(12.6, abs=1e-9)
 
@@ -381,10 +376,10 @@ def test_joint_limits_effort_and_speed() -> None:
     assert set(joints) == set(JOINTS)
     for i, name in enumerate(JOINTS):
         limit = {key: float(value) for key, value in find(joints[name], "limit").items()}
-        assert [limit["lower"], limit["upper"]] == JOINT_LIMITS[i].tolist()
+        assert [limit["lower"], limit["upper"]] == GEOMETRY.joint_limits[i].tolist()
         assert limit["effort"] == CONFIG.torque_limit[i % 3]
         assert limit["velocity"] == CONFIG.speed_limit[i % 3]
-        low, high = JOINT_LIMITS[i]
+        low, high = GEOMETRY.joint_limits[i]
         assert low < nominal_pose(CONFIG)[i] < high
 
 
@@ -412,14 +407,3 @@ def test_left_and_right_are_mirror_images() -> None:
             for one, other in zip(left.iter("origin"), right.iter("origin"), strict=True):
                 x, y, z = numbers(one.attrib["xyz"])
                 assert numbers(other.attrib["xyz"]) == [x, -y, z]
-
-
-def test_a_urdf_that_is_not_there() -> None:
-    with pytest.raises(ConfigError, match=r"^robot\.urdf: no file 'urdf/centipede\.urdf' here"):
-        urdf_path(RobotConfig(urdf="urdf/centipede.urdf"))
-
-
-def test_a_urdf_elsewhere(tmp_path: Path) -> None:
-    copy = tmp_path / "copy.urdf"
-    copy.write_bytes(URDF.read_bytes())
-    assert urdf_path(RobotConfig(urdf=str(copy))) == copy

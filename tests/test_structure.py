@@ -27,6 +27,7 @@ RANKS = {
     "gaits": 1,
     "curriculum": 1,
     "commands": 2,
+    "geometry": 2,
     "tiles": 2,
     "robot": 3,
     "worker": 2,

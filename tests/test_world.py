@@ -13,25 +13,22 @@ import pybullet
 import pytest
 
 from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.geometry import read_geometry
 from tdgc.locomotion import Locomotion
 from tdgc.low_env import is_fallen
-from tdgc.robot import (
-    FOOT_RADIUS,
-    TRUNK_MASS,
-    Array,
-    foot_kinematics,
-    nominal_pose,
-    yaw_quaternion,
-)
+from tdgc.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
 from tdgc.terrain import ALL_FAMILIES, HEIGHT_RANGE, TileField, make_tile, tile_rng
 from tdgc.world import CLIENT_ROBOTS, World
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()
-NOMINAL = nominal_pose(ROBOT)
+GEOMETRY, NOMINAL = read_geometry(ROBOT), nominal_pose(ROBOT)
 MASS = 12.6  # kg
 G = 9.81
 #: Trunk above the soles in the nominal pose, m.
-STAND = FOOT_RADIUS - foot_kinematics(NOMINAL[None], np.zeros((1, 12)))[0][0, :, 2].min()
+STAND = (
+    GEOMETRY.foot_radius
+    - foot_kinematics(GEOMETRY, NOMINAL[None], np.zeros((1, 12)))[0][0, :, 2].min()
+)
 UPSIDE_DOWN = np.array([[1.0, 0.0, 0.0, 0.0]])
 
 
@@ -195,13 +192,6 @@ def test_fields_that_do_not_fit() -> None:
     world.close()
 
 
-def test_a_urdf_without_the_joints(tmp_path: Path) -> None:
-    urdf = tmp_path / "box.urdf"
-    urdf.write_text('<robot name="box"><link name="trunk"/></robot>', encoding="utf-8")
-    with pytest.raises(ValueError, match=r"lacks the joints FL_hip_joint, FL_thigh_joint"):
-        World(1, RobotConfig(urdf=str(urdf)), PHYSICS)
-
-
 def resident() -> float:
     """MB of memory of this process."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
@@ -269,13 +259,13 @@ def test_payload_adds_its_weight(plane: World, payload: float) -> None:
     hold(plane, 50)
     assert mean_foot_force(plane)[0].sum() == pytest.approx((MASS + payload) * G, rel=0.01)
     mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
-    assert mass == pytest.approx(TRUNK_MASS + payload)
+    assert mass == pytest.approx(GEOMETRY.trunk_mass + payload)
     nominal = np.array([0.016147, 0.068159, 0.073013])
-    np.testing.assert_allclose(inertia, nominal * mass / TRUNK_MASS, rtol=1e-6)
+    np.testing.assert_allclose(inertia, nominal * mass / GEOMETRY.trunk_mass, rtol=1e-6)
     # Not on top of the last payload.
     plane.set_dynamics([0], np.array([0.8]), np.array([0.0]))
     mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
-    assert mass == pytest.approx(TRUNK_MASS)
+    assert mass == pytest.approx(GEOMETRY.trunk_mass)
     np.testing.assert_allclose(inertia, nominal, rtol=1e-6)
 
 
@@ -301,7 +291,9 @@ def test_a_dropped_robot_lands_on_its_feet(plane: World) -> None:
         assert plane.state.trunk_force[0] == 0.0
     assert largest > 2 * MASS * G
     assert (plane.state.foot_force[0] > 1.0).all()
-    assert plane.state.foot_position[0, :, 2].tolist() == pytest.approx([FOOT_RADIUS] * 4, abs=2e-3)
+    assert plane.state.foot_position[0, :, 2].tolist() == pytest.approx(
+        [GEOMETRY.foot_radius] * 4, abs=2e-3
+    )
 
 
 def test_a_robot_dropped_on_its_back_hits_with_its_trunk(plane: World) -> None:
@@ -403,7 +395,7 @@ def sinking(family: str, seed: int) -> tuple[int, int]:
         limit = ROBOT.action_limit
         loco.act(rng.uniform(-limit, limit, (robots, 12)))
         x, y, z = np.moveaxis(world.state.foot_position, -1, 0)
-        clearance = z - FOOT_RADIUS - world.ground_height(x, y)
+        clearance = z - GEOMETRY.foot_radius - world.ground_height(x, y)
         on = field.on_tile(index[:, None], 0, x, y)
         samples += int(on.sum())
         sunk += int(((clearance < -0.01) & on).sum())

@@ -1,0 +1,296 @@
+"""What is read from a URDF, of the shipped robot and of another; what is refused, and why."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pytest
+import torch as th
+
+from tdgc import rewards
+from tdgc.commands import INDEX, default_command
+from tdgc.config import ConfigError, LowLevelConfig, PhysicsConfig, RobotConfig
+from tdgc.export import Pose
+from tdgc.gaits import PhaseClock, swing_profile
+from tdgc.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
+from tdgc.low_env import LowLevelTask
+from tdgc.robot import (
+    commanded_pose,
+    foot_kinematics,
+    leg_angles,
+    nominal_pose,
+    rotation_matrix,
+)
+from tdgc.world import World
+
+SHIPPED = urdf_path(RobotConfig()).read_text(encoding="utf-8")
+STILL, UPRIGHT = np.zeros((1, 12)), np.array([[0.0, 0.0, 0.0, 1.0]])
+
+
+def larger(text: str) -> str:
+    """Our robot with longer legs, hips further out and apart, a heavier trunk and other limits."""
+    for old, new in (
+        ('xyz="0 0 -0.213"', 'xyz="0 0 -0.25"'),  # calf joints, knees and feet
+        ('<origin xyz="0.183 ', '<origin xyz="0.22 '),
+        ('<origin xyz="-0.183 ', '<origin xyz="-0.2 '),
+        (' 0.047 0"', ' 0.06 0"'),
+        (' -0.047 0"', ' -0.06 0"'),
+        ('<origin xyz="0 0.08 0"', '<origin xyz="0 0.09 0"'),
+        ('<origin xyz="0 -0.08 0"', '<origin xyz="0 -0.09 0"'),
+        ('<mass value="5.6"/>', '<mass value="8.4"/>'),
+        ('radius="0.022"', 'radius="0.03"'),
+        ('lower="-2.82"', 'lower="-2.6"'),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    # Right hips turn as far outwards as left ones, in a mirror.
+    limits = 'lower="{}" upper="{}" effort="23.7" velocity="30"'
+    for leg, low, high in (("FL", -0.7, 0.9), ("FR", -0.9, 0.7)):
+        before, joint, after = text.partition(f'<joint name="{leg}_hip_joint"')
+        text = (
+            before + joint + after.replace(limits.format(-0.86, 0.86), limits.format(low, high), 1)
+        )
+    return text
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> RobotConfig:
+    """The larger robot, with what goes with it."""
+    path = tmp_path / "larger.urdf"
+    path.write_text(larger(SHIPPED), encoding="utf-8")
+    return RobotConfig(urdf=str(path), kp=40.0, kd=1.0, base_height=0.35)
+
+
+# ------------------------------------------------------------------ what is read
+
+
+def test_the_shipped_robot() -> None:
+    geometry = read_geometry(RobotConfig())
+    hips = [[0.183, 0.047], [0.183, -0.047], [-0.183, 0.047], [-0.183, -0.047]]
+    assert geometry.hips.tolist() == hips
+    assert (geometry.abduction, geometry.thigh, geometry.calf) == (0.08, 0.213, 0.213)
+    assert (geometry.foot_radius, geometry.trunk_mass) == (0.022, 5.6)
+    limits = [[-0.86, 0.86], [-0.69, 4.5], [-2.82, -0.89]] * 4
+    assert geometry.joint_limits.tolist() == limits
+
+
+def test_another_robot(robot: RobotConfig) -> None:
+    geometry = read_geometry(robot)
+    assert geometry.hips.tolist() == [[0.22, 0.06], [0.22, -0.06], [-0.2, 0.06], [-0.2, -0.06]]
+    assert (geometry.abduction, geometry.thigh, geometry.calf) == (0.09, 0.25, 0.25)
+    assert (geometry.foot_radius, geometry.trunk_mass) == (0.03, 8.4)
+    assert geometry.joint_limits[::3].tolist() == [
+        [-0.7, 0.9], [-0.9, 0.7], [-0.86, 0.86], [-0.86, 0.86]
+    ]  # fmt: skip
+    assert geometry.joint_limits[2::3].tolist() == [[-2.6, -0.89]] * 4
+
+
+def test_legs_and_their_sides() -> None:
+    assert JOINTS[:4] == ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint", "FR_hip_joint")
+    assert FRONT.tolist() == [1.0, 1.0, -1.0, -1.0] and SIDE.tolist() == [1.0, -1.0, 1.0, -1.0]
+
+
+def test_names_of_links_and_order_do_not_matter(tmp_path: Path) -> None:
+    path = tmp_path / "renamed.urdf"
+    text = re.sub(r'"trunk"', '"body"', SHIPPED).replace('_calf"', '_shank"')
+    legs = re.findall(r'  <joint name=.*?(?=\n  <joint name="\w\w_hip|\n</robot>)', text, re.DOTALL)
+    assert len(legs) == 4
+    head, tail = text[: text.index(legs[0])], "\n</robot>\n"
+    path.write_text(head + "\n".join(reversed(legs)) + tail, encoding="utf-8")
+    geometry = read_geometry(RobotConfig(urdf=str(path)))
+    assert geometry.hips.tolist() == read_geometry(RobotConfig()).hips.tolist()
+
+
+# ------------------------------------------------------------------ another robot, everywhere
+
+
+def test_kinematics_of_another_robot_are_bullets(robot: RobotConfig) -> None:
+    """In any attitude: a foot is 0.25 m along the calf that Bullet says where it is."""
+    world, rng = World(1, robot, PhysicsConfig()), np.random.default_rng(0)
+    geometry = world.state.geometry
+    body, client = world._bodies[0], world._client_of[0]
+    try:
+        for _ in range(5):
+            quaternion = np.array([pybullet.getQuaternionFromEuler(rng.uniform(-1.5, 1.5, 3))])
+            q = rng.uniform(*geometry.joint_limits.T)[None]
+            world.reset_robots([0], rng.uniform(-1.0, 1.0, (1, 3)), quaternion, q)
+            for k in range(4):
+                link = client.getLinkState(body, world._joints[3 * k + 2], 0, 1)
+                turned = rotation_matrix(np.array([link[5]]))[0]
+                foot = np.array(link[4]) + turned @ [0.0, 0.0, -0.25]
+                np.testing.assert_allclose(world.state.foot_position[0, k], foot, atol=1e-7)
+    finally:
+        world.close()
+
+
+def test_leg_angles_of_another_robot(robot: RobotConfig) -> None:
+    geometry, rng = read_geometry(robot), np.random.default_rng(1)
+    q = nominal_pose(robot) + rng.uniform(-0.4, 0.4, (200, 12))
+    feet, _ = foot_kinematics(geometry, q, np.zeros_like(q))
+    np.testing.assert_allclose(leg_angles(geometry, feet), q, atol=1e-12)
+    # The shipped robot's legs would reach elsewhere with them.
+    shipped, _ = foot_kinematics(read_geometry(RobotConfig()), q, np.zeros_like(q))
+    assert np.abs(feet - shipped).min(axis=0).max() > 0.03
+
+
+def test_payload_is_on_top_of_its_own_trunk(robot: RobotConfig) -> None:
+    world = World(1, robot, PhysicsConfig())
+    world.set_dynamics([0], np.array([0.8]), np.array([2.1]))
+    mass, _, inertia, *_ = world._client_of[0].getDynamicsInfo(world._bodies[0], -1)
+    world.close()
+    assert mass == pytest.approx(10.5)
+    np.testing.assert_allclose(inertia, np.array([0.016147, 0.068159, 0.073013]) * 1.25, rtol=1e-6)
+
+
+def test_another_robot_stands_at_the_commanded_height(robot: RobotConfig) -> None:
+    """On zero actions it stands on its feet at its base height, and 3 cm lower when told to."""
+    task = LowLevelTask(LowLevelConfig(robot=robot), 2, seed=0, training=False)
+    task.reset(np.arange(2))
+    command = np.tile(default_command(), (2, 1))
+    command[1, INDEX["body_height"]] = -0.03
+    for _ in range(100):
+        task.locomotion.command[:] = command
+        _, terminated, _ = task.step(np.zeros((2, 12)))
+        assert not terminated.any()
+    state = task.locomotion.world.state
+    task.locomotion.world.close()
+    np.testing.assert_allclose(state.position[:, 2], [0.35, 0.32], atol=0.01)
+    np.testing.assert_allclose(state.foot_position[..., 2], 0.03, atol=3e-3)
+    assert state.foot_force.sum(axis=1) == pytest.approx([15.4 * 9.81] * 2, rel=0.02)
+    assert (state.leg_force == 0.0).all()
+
+
+def test_commanded_and_exported_pose_of_another_robot(robot: RobotConfig) -> None:
+    geometry, rng = read_geometry(robot), np.random.default_rng(2)
+    command = np.tile(default_command(), (20, 1))
+    for name, low, high in (
+        ("body_height", -0.03, 0.03), ("stance_width", 0.2, 0.35), ("stance_length", 0.33, 0.43)
+    ):  # fmt: skip
+        command[:, INDEX[name]] = rng.uniform(low, high, 20)
+    clock = PhaseClock(20)
+    clock.reset(np.arange(20), rng.uniform(size=20))
+    clock.update(command[:, 12:], command[:, INDEX["duration"]])
+    pose = commanded_pose(robot, geometry, command, swing_profile(clock.phases))
+    feet, _ = foot_kinematics(geometry, pose, np.zeros_like(pose))
+    rest, _ = foot_kinematics(geometry, nominal_pose(robot)[None], STILL)
+    moved = np.broadcast_to(-command[:, INDEX["body_height"], None], (20, 4))
+    np.testing.assert_allclose((feet - rest)[..., 2], moved, atol=1e-9)
+    graph = Pose(robot)
+    for k in range(20):
+        given = th.from_numpy(clock.clock[k : k + 1]), th.from_numpy(command[k])
+        np.testing.assert_allclose(graph(*given).numpy(), pose[k], atol=1e-6)
+
+
+def test_rewards_know_another_robots_limits(robot: RobotConfig) -> None:
+    """A knee at -2.6 rad is at its limit, 0.0855 rad beyond nine tenths of -2.6..-0.89."""
+    task = LowLevelTask(LowLevelConfig(robot=robot), 1, seed=0)
+    q = nominal_pose(robot)
+    q[2] = -2.6
+    task.locomotion.world.reset_robots([0], np.array([[0.0, 0.0, 1.0]]), UPRIGHT, q[None])
+    step = task._low_step(np.zeros((1, 12)))
+    task.locomotion.world.close()
+    np.testing.assert_allclose(rewards.joint_limits(step), [0.05 * (2.6 - 0.89)], atol=1e-12)
+    swing = dataclasses.replace(step, contact=np.zeros((1, 4)), swing=np.zeros((1, 4)))
+    on_ground = dataclasses.replace(swing, foot_height=np.full((1, 4), 0.03))
+    assert rewards.swing_height(on_ground).tolist() == [0.0]
+
+
+# ------------------------------------------------------------------ what is refused
+
+
+def test_a_urdf_that_is_not_there() -> None:
+    with pytest.raises(ConfigError, match=r"^robot\.urdf: no file 'urdf/centipede\.urdf' here"):
+        read_geometry(RobotConfig(urdf="urdf/centipede.urdf"))
+
+
+def test_a_urdf_elsewhere(tmp_path: Path) -> None:
+    copy = tmp_path / "copy.urdf"
+    copy.write_text(SHIPPED, encoding="utf-8")
+    assert urdf_path(RobotConfig(urdf=str(copy))) == copy
+
+
+FL_HIP = '<origin xyz="0.183 0.047 0" rpy="0 0 0"/>'
+FIXED = '<joint name="imu_joint" type="fixed"><parent link="trunk"/><child link="imu"/></joint>'
+DIFFERS = "legs must be equal, mirrored left to right"
+
+#: What is replaced in the shipped URDF, all of it, by what, and how the message goes on after the
+#: file's name.
+REFUSED = [
+    ("</robot>", "", r"not an XML file: no element found"),
+    ("<robot ", "<!DOCTYPE robot><robot ", r"a URDF has no document type \(<!DOCTYPE>\)"),
+    ("RR_thigh_joint", "RR_knee_joint", r"lacks the joints RR_thigh_joint"),
+    ("</robot>", f"{FIXED}</robot>", r"has the joint 'imu_joint' beside the twelve of its legs"),
+    ("</robot>", "<link name='imu'/></robot>", r"its links must be the trunk .* it has 14"),
+    ('<parent link="FL_hip"/>', '<parent link="FR_hip"/>', r"joint 'FL_thigh_joint': its parent"),
+    ("revolute", "continuous", r"joint 'FL_hip_joint': must be revolute about the axis 1 0 0"),
+    ('<axis xyz="1 0 0"/>', '<axis xyz="-1 0 0"/>', r"joint 'FL_hip_joint': .* axis 1 0 0"),
+    ('<axis xyz="0 1 0"/>', '<axis xyz="0 0 1"/>', r"joint 'FL_thigh_joint': .* axis 0 1 0"),
+    (FL_HIP, FL_HIP.replace("0.047 0", "0.047 0.1"), r"joint 'FL_hip_joint': .* x y 0, x > 0 in"),
+    (FL_HIP, FL_HIP.replace("0.183", "-0.183"), r"joint 'FL_hip_joint': its origin must be x y 0"),
+    (FL_HIP, FL_HIP.replace("0.183", "0.2"), rf"the origin of FR_hip_joint .* FL.*: {DIFFERS}"),
+    (FL_HIP, FL_HIP.replace('rpy="0', 'rpy="0.1'), r"joint 'FL_hip_joint': .* turned, rpy 0 0 0"),
+    (FL_HIP, FL_HIP.replace("0.183", "nan"), r"joint 'FL_hip_joint': origin xyz must be 3 numbers"),
+    ('"0 -0.08 0"', '"0 -0.09 0"', rf"the origin of FR_thigh_joint .* FL_thigh_joint: {DIFFERS}"),
+    ('"0 -0.08 0"', '"0.01 -0.08 0"', r"joint 'FR_thigh_joint': its origin must be 0 y 0"),
+    ('lower="-2.82"', 'lower="0.1"', r"joint 'FL_calf_joint': its limits must be lower < upper"),
+    ('lower="-2.82" upper="-0.89"', 'lower="0.89" upper="2.82"', r".*: a knee bends to negative"),
+    ('lower="-0.86"', 'lower="-0.5"', rf"the limits of FR_hip_joint .* FL_hip_joint: {DIFFERS}"),
+    ('lower="-0.86"', "", r"joint 'FL_hip_joint': limit lower must be a number, not ''"),
+    (
+        '<sphere radius="0.022"/>',
+        '<box size="1 1 1"/>',
+        r"link 'FL_calf': its lowest collision shape",
+    ),
+    ("collision", "collided", r"link 'FL_calf': its lowest collision shape must be its foot"),
+    ('<sphere radius="0.022"/>', "<sphere/>", r".*collision.2./geometry/sphere radius must be a"),
+    (
+        '0 -0.213" rpy="0 0 0"/><geometry><sphere',
+        '0.01 -0.213" rpy="0 0 0"/><geometry><sphere',
+        r"link 'FL_calf': the foot must be at 0 0 z",
+    ),
+    ('<mass value="5.6"/>', '<mass value="0"/>', r"link 'trunk': its mass must be positive, not 0"),
+    ('<mass value="0.95"/>', "", r"link 'FL_thigh': inertial/mass value must be a number"),
+    ('izz="0.073013" ixy="0"', 'izz="0.073013" ixy="0.01"', r"link 'trunk': .* centre of mass and"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), REFUSED)
+def test_a_urdf_that_does_not_fit(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "other.urdf"
+    assert old in SHIPPED
+    path.write_text(SHIPPED.replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError, match=rf"^{re.escape(str(path))}: {message}") as caught:
+        read_geometry(RobotConfig(urdf=str(path)))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError, match=message):
+        World(1, RobotConfig(urdf=str(path)), PhysicsConfig())
+
+
+def test_one_leg_with_another_foot(tmp_path: Path) -> None:
+    before, leg, after = SHIPPED.partition('<link name="RR_calf">')
+    path = tmp_path / "other.urdf"
+    path.write_text(before + leg + after.replace('"0.022"', '"0.03"'), encoding="utf-8")
+    with pytest.raises(
+        ConfigError, match=rf": the foot of RR does not fit the foot of FL: {DIFFERS}"
+    ):
+        read_geometry(RobotConfig(urdf=str(path)))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\xfe<robot/>", b"<robot>\x00</robot>", b"\x00" * 50]
+)
+def test_a_file_that_is_no_urdf(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "noise.urdf"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"noise\.urdf: (not an XML file|not UTF-8 text)"):
+        read_geometry(RobotConfig(urdf=str(path)))
+
+
+def test_a_urdf_that_bullet_cannot_load(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.urdf"
+    box, mesh = '<box size="0.42 0.15 0.11"/>', '<mesh filename="nothing.stl"/>'
+    path.write_text(SHIPPED.replace(box, mesh), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"mesh\.urdf: Bullet cannot load it and says why above$"):
+        World(1, RobotConfig(urdf=str(path)), PhysicsConfig())
