@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from tdgc import cluster, diagnosis, film, gui, plots, report, tuning
 from tdgc.cluster import CLUSTER_HELP
-from tdgc.config import LowLevelConfig
+from tdgc.config import ConfigError, LowLevelConfig
 from tdgc.cores import usable_cores, workers_flag
 from tdgc.diagnosis import Diagnosis, diagnose
 from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
@@ -370,6 +370,7 @@ def main(arguments: list[str] | None = None) -> int:
         if args.tracking and (traced is not None or tuned is not None):
             raise ValueError("--tracking is of the low level alone: no --trace, --tune or --set")
         low, config = load_low(args.low)
+        read_geometry(config.robot)  # before the results of an earlier call are removed
         drivers = {} if args.tracking else make_drivers(names, high, low, config, tuned)
         args.out.mkdir(parents=True, exist_ok=True)
         if not args.tracking and args.gui is None:
@@ -385,6 +386,9 @@ def main(arguments: list[str] | None = None) -> int:
             return run_tracking(low, args)
         cells = plan(list(drivers), conditions, families, levels, args.episodes)
         return run_table(low, drivers, cells, args, traced, tuned)
+    except ConfigError as error:  # a robot that Bullet cannot load
+        print(f"evaluate.py: {error}", file=sys.stderr)
+        return 2
     except WorkerError as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 1

@@ -216,6 +216,9 @@ def test_a_low_level_that_does_not_match_is_refused_by_name(low, tmp_path):
     )
     with pytest.raises(ConfigError, match=r"with robot.commanded_pose True, not False$"):
         load_high(path, policy, fixed)
+    other = dataclasses.replace(config, robot=dataclasses.replace(config.robot, urdf="other.urdf"))
+    with pytest.raises(ConfigError, match=r"with robot.urdf urdf/quadruped.urdf, not other.urdf$"):
+        load_high(path, policy, other)
     narrow = dataclasses.replace(
         config, commands=dataclasses.replace(CommandRanges(), vy=(-0.3, 0.3))
     )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,15 @@ import pybullet
 import pytest
 import torch as th
 
+import evaluate
+import train_low
 from tdgc import rewards
 from tdgc.commands import INDEX, default_command
 from tdgc.config import ConfigError, LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.export import Pose
 from tdgc.gaits import PhaseClock, swing_profile
 from tdgc.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
+from tdgc.high_env import PRETRAINED
 from tdgc.low_env import LowLevelTask
 from tdgc.robot import (
     commanded_pose,
@@ -294,3 +298,30 @@ def test_a_urdf_that_bullet_cannot_load(tmp_path: Path) -> None:
     path.write_text(SHIPPED.replace(box, mesh), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"mesh\.urdf: Bullet cannot load it and says why above$"):
         World(1, RobotConfig(urdf=str(path)), PhysicsConfig())
+
+
+def test_scripts_refuse_it_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A robot to be trained, one that a policy was trained on, and one that only Bullet refuses."""
+    path, results = tmp_path / "other.urdf", tmp_path / "results" / "diagnosis.csv"
+    low = tmp_path / "low.json"
+    text = (PRETRAINED / "low.json").read_text(encoding="utf-8")
+    low.write_text(text.replace("urdf/quadruped.urdf", str(path)), encoding="utf-8")
+    shutil.copy(PRETRAINED / "low.safetensors", tmp_path)
+    results.parent.mkdir()
+    results.touch()
+    train = ["--out", str(tmp_path / "run"), "--workers", "1", "--set", f"env.robot.urdf={path}"]
+    table = ["--policies", "gp", "--episodes", "1", "--levels", "6", "--families", "tilt"]
+    table += ["--low", str(low.with_suffix("")), "--out", str(results.parent), "--workers", "1"]
+    path.write_text(SHIPPED.replace("RR_hip_joint", "RR_hip"), encoding="utf-8")
+    for name, main, arguments in (
+        ("train_low.py", train_low.main, train),
+        ("evaluate.py", evaluate.main, table),
+        ("evaluate.py", evaluate.main, [*table, "--tracking"]),
+    ):
+        assert main(arguments) == 2
+        assert capfd.readouterr().err == f"{name}: {path}: lacks the joints RR_hip_joint\n"
+    assert results.exists()
+    path.write_text(SHIPPED.replace('<box size="0.42 0.15 0.11"/>', "<box/>"), encoding="utf-8")
+    assert evaluate.main(table) == 2
+    said = f"evaluate.py: {path}: Bullet cannot load it and says why above"
+    assert capfd.readouterr().err.splitlines()[-1] == said

@@ -20,6 +20,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 BY_CI = None  # .ci/run runs the set-up and the tests as README has them
 TRAIN = "--steps 128 --n-envs 4 --workers 1"
+TRAIN_HIGH = "--steps 16 --n-envs 4 --workers 1 --set ppo.n_steps=2 --set ppo.minibatches=1"
 #: Each command of README -> what is added to make it short, or BY_CI. ``{tmp}`` is a folder that
 #: the commands share; they run in this order, which is README's.
 COMMANDS: dict[str, str | None] = {
@@ -34,8 +35,7 @@ COMMANDS: dict[str, str | None] = {
     "python train_low.py --resume --time-limit 3600": "--steps 256 --out {tmp}/low",
     "tensorboard --logdir runs": "--inspect --logdir {tmp}",
     "python train_high.py --low runs/low/policy": (
-        "--low {tmp}/low/policy --steps 16 --n-envs 4 --workers 1 --set ppo.n_steps=2 "
-        "--set ppo.minibatches=1 --out {tmp}/high"
+        f"{TRAIN_HIGH} --low {{tmp}}/low/policy --out {{tmp}}/high"
     ),
     "python evaluate.py --low runs/low/policy --policies gp --levels 6-10": (
         "--low {tmp}/low/policy --policies gp --levels 6 --families tilt --episodes 1 --workers 1 "
@@ -56,6 +56,11 @@ COMMANDS: dict[str, str | None] = {
     ),
     "python -m tdgc.export --low runs/low/policy --high runs/high/policy --out runs/export": (
         "--low {tmp}/low/policy --high {tmp}/high/policy --format torchscript --out {tmp}/export"
+    ),
+    "python train_low.py --set env.robot.urdf=my_robot.urdf --set env.robot.base_height=0.34 "
+    "--out runs/my_low": f"{TRAIN} --set env.robot.urdf={{tmp}}/my_robot.urdf --out {{tmp}}/my_low",
+    "python train_high.py --low runs/my_low/policy --out runs/my_high": (
+        f"{TRAIN_HIGH} --low {{tmp}}/my_low/policy --out {{tmp}}/my_high"
     ),
     "python -m tdgc.bench --out runs/bench": (
         "--robots 2 --workers 1 --seconds 0.1 --out {tmp}/bench"
@@ -84,6 +89,8 @@ OUTPUTS = (
     "video/films/strip_gap_10.png",
     "export/low.pt",
     "export/high_interface.json",
+    "my_low/policy.safetensors",
+    "my_high/policy.safetensors",
     "bench/bench.json",
 )
 PROGRAMS = {
@@ -118,6 +125,9 @@ def test_every_command_is_in_the_table() -> None:
 
 def test_commands_run(tmp_path: Path) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    shipped = (ROOT / "urdf" / "quadruped.urdf").read_text(encoding="utf-8")
+    longer = shipped.replace(" -0.213", " -0.25")  # thighs and calves, m
+    (tmp_path / "my_robot.urdf").write_text(longer, encoding="utf-8")
     for command, added in COMMANDS.items():
         if added is BY_CI:
             continue
