@@ -152,13 +152,14 @@ def test_another_robot_stands_at_the_commanded_height(robot: RobotConfig) -> Non
     """On zero actions it stands on its feet at its base height, and 3 cm lower when told to."""
     task = LowLevelTask(LowLevelConfig(robot=robot), 2, seed=0, training=False)
     task.reset(np.arange(2))
+    state = task.locomotion.world.state
+    np.testing.assert_allclose(state.foot_position[..., 2].min(axis=1), 0.03, atol=1e-12)
     command = np.tile(default_command(), (2, 1))
     command[1, INDEX["body_height"]] = -0.03
     for _ in range(100):
         task.locomotion.command[:] = command
         _, terminated, _ = task.step(np.zeros((2, 12)))
         assert not terminated.any()
-    state = task.locomotion.world.state
     task.locomotion.world.close()
     np.testing.assert_allclose(state.position[:, 2], [0.35, 0.32], atol=0.01)
     np.testing.assert_allclose(state.foot_position[..., 2], 0.03, atol=3e-3)
