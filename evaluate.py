@@ -42,7 +42,7 @@ from tdgc.high_env import PRETRAINED, load_low
 from tdgc.policies import Policy
 from tdgc.recording import Recorder, Recording, Together
 from tdgc.teacher import STYLES
-from tdgc.terrain import ALL_FAMILIES, FAMILIES, OOD_LEVELS
+from tdgc.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
 from tdgc.trace import Selection, Trace, Tracer, check_installed, write
 from tdgc.tuning import TunedDriver, Tuning
 from tdgc.worker import WorkerError
@@ -57,7 +57,11 @@ SHIPPED_HIGH = PRETRAINED / "high"
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
-    parser.add_argument("--families", default="all", help=f"all, or of {', '.join(ALL_FAMILIES)}")
+    parser.add_argument(
+        "--families",
+        default="all",
+        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING}",
+    )
     parser.add_argument("--episodes", type=int, default=100, help="a cell (100)")
     parser.add_argument(
         "--policies",
@@ -338,12 +342,18 @@ def main(arguments: list[str] | None = None) -> int:
     high = args.high or (SHIPPED_HIGH if shipped else None)
     try:
         levels = choose_levels(args.levels)
-        families = choose(args.families, ALL_FAMILIES, FAMILIES, "family")
+        maps = tuple(name for name in args.families.split(",") if is_map(name))
+        families = choose(args.families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
+        for name in maps:
+            height_map(name)
         default = "gp" if high is None else "all"
         names = choose(args.policies or default, (*POLICIES, TEACHER), POLICIES, "policy")
         conditions = choose(args.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition")
-        if TEACHER in names and "mixed" in (*families, *conditions):
-            raise ValueError(f"the {TEACHER} knows {', '.join(STYLES)}; it cannot lead on mixed")
+        met = (*families, *(name for name in conditions if name in ALL_FAMILIES))
+        if TEACHER in names and not set(met) <= set(STYLES):
+            strange = next(name for name in met if name not in STYLES)
+            known = ", ".join(STYLES)
+            raise ValueError(f"the {TEACHER} knows {known}; it cannot lead on {strange}")
         if args.gui is not None and args.cluster is not None:
             raise ValueError("--gui shows a robot of this machine: no --cluster")
         cores = usable_cores() if args.cluster is None else cluster.connect(args.cluster)

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from tdgc.evaluation import Episode, tile_of
 from tdgc.robot import HIPS_XY, Array
 from tdgc.terrain import (
-    FAMILIES,
     GOAL_BEGIN,
     HALF_ZONES,
     MAX_LEVEL,
@@ -152,7 +151,7 @@ def _judge(trace: Trace, tile: Tile) -> tuple[str, str, str]:
     towards = asked_towards(trace, intervals)
     evidence = _evidence(trace, intervals, errors, limits, towards)
     down = trace.outcome == "fell" or (trace.outcome == "collided" and not held[-1])
-    if trace.family not in FAMILIES or trace.level > MAX_LEVEL:
+    if trace.family == "mixed" or trace.level > MAX_LEVEL:
         return "terrain", "never trained on", evidence
     if lost:
         return "execution", f"lost track of {' and '.join(lost)}", evidence

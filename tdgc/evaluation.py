@@ -29,7 +29,16 @@ from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE, is_fallen
 from tdgc.policies import Policy
 from tdgc.rewards import CONTACT_FORCE
 from tdgc.robot import NUM_JOINTS, Array, RobotState
-from tdgc.terrain import ALL_FAMILIES, EVAL_STREAM, MAX_LEVEL, Tile, TileField, make_tile, tile_rng
+from tdgc.terrain import (
+    EVAL_STREAM,
+    MAX_LEVEL,
+    Tile,
+    TileField,
+    family_number,
+    file_label,
+    make_tile,
+    tile_rng,
+)
 from tdgc.worker import keep_memory, one_blas_thread
 
 HORIZON = 20.0  # s (benchmark)
@@ -83,6 +92,11 @@ class Cell:
     level: int
     first: int
     count: int
+
+
+def episode_name(policy: str, condition: str, family: str, level: int, episode: int) -> str:
+    """A name for an episode's files, a different one for each of an evaluation."""
+    return f"{policy}_{condition}_{file_label(family)}_{level:02d}_{episode:03d}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +157,7 @@ def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
 
 def push_velocities(cell: Cell, seed: int, speed: float, pushes: int) -> Array:
     """Push k of each episode, (count, pushes, 3) m/s: the same for every policy."""
-    family = ALL_FAMILIES.index(cell.family)
+    family = family_number(cell.family)
     result = np.zeros((cell.count, pushes, 3))
     for k in range(cell.count):
         entropy = (EVAL_STREAM, seed, family, cell.level, cell.first + k, 1)

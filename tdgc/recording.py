@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tdgc.config import RobotConfig
 from tdgc.drivers import Driver
-from tdgc.evaluation import OUTCOMES, Cell, Watcher
+from tdgc.evaluation import OUTCOMES, Cell, Watcher, episode_name
 from tdgc.locomotion import Locomotion
 from tdgc.rewards import CONTACT_FORCE
 from tdgc.robot import Array
@@ -58,9 +58,8 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """A name for its files, a different one for each episode of an evaluation."""
-        where = f"{self.policy}_{self.condition}_{self.family}"
-        return f"{where}_{self.level:02d}_{self.episode:03d}"
+        """A name for its files, see ``episode_name``."""
+        return episode_name(self.policy, self.condition, self.family, self.level, self.episode)
 
     @property
     def ending(self) -> str:

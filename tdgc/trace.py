@@ -25,7 +25,7 @@ from tdgc import rewards
 from tdgc.commands import CONTINUOUS, INDEX, NAMES, NUM_ACTIONS, UNITS, CommandDecoder, gait_index
 from tdgc.drivers import Driver
 from tdgc.errors import InputError, install_hint
-from tdgc.evaluation import OUTCOMES, Cell, joint_power
+from tdgc.evaluation import OUTCOMES, Cell, episode_name, joint_power
 from tdgc.gaits import FEET, GAITS
 from tdgc.high_env import PROBES, SEMANTIC, command_share, height_probes, high_step
 from tdgc.locomotion import Locomotion
@@ -129,8 +129,8 @@ class Trace:
     @property
     def file_name(self) -> str:
         """Its file's name, a different one for each episode of an evaluation."""
-        where = f"{self.policy}_{self.condition}_{self.family}"
-        return f"{where}_{self.level:02d}_{self.episode:03d}.parquet"
+        name = episode_name(self.policy, self.condition, self.family, self.level, self.episode)
+        return f"{name}.parquet"
 
 
 _META = tuple(f for f in dataclasses.fields(Trace) if f.name != "columns")
