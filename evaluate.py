@@ -221,13 +221,16 @@ def print_table(summary: dict[str, Any]) -> None:
             print(f"\n{policy}, {condition}")
             names = [f for f in families if f != "mean"]
             levels = list(families[names[0]])
-            print("family  " + "".join(f"{level:>8}" for level in levels))
+            wide = max(8, *(len(name) + 1 for name in names))
+            print("family".ljust(wide) + "".join(f"{level:>8}" for level in levels))
             for name in names:
                 cells = "".join(f"{100 * families[name][lv]['rate']:7.1f}%" for lv in levels)
-                print(f"{name:<8}{cells}")
+                print(name.ljust(wide) + cells)
             mean = families["mean"]
             low, high = 100 * mean["ci_low"], 100 * mean["ci_high"]
-            print(f"mean    {100 * mean['rate']:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}")
+            print(
+                f"{'mean'.ljust(wide)}{100 * mean['rate']:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}"
+            )
 
 
 def run_tracking(low: Policy, args: argparse.Namespace) -> int:

@@ -329,13 +329,14 @@ def describe(diagnoses: Sequence[Diagnosis], episodes: Sequence[Episode]) -> str
         if not mine:
             continue
         head = "".join(f"{layer:>11}" for layer in LAYERS)
-        lines.append(f"family  level{head}  commonest cause")
+        wide = max(8, *(len(d.family) + 1 for d in mine))
+        lines.append(f"{'family'.ljust(wide)}level{head}  commonest cause")
         for family, level in dict.fromkeys((d.family, d.level) for d in mine):
             cell = [d for d in mine if (d.family, d.level) == (family, level)]
             counts = Counter(d.layer for d in cell)
             numbers = "".join(f"{counts[layer]:>11}" for layer in LAYERS)
             cause, times = Counter(d.cause for d in cell).most_common(1)[0]
-            lines.append(f"{family:<8}{level:>5}{numbers}  {cause} ({times})")
+            lines.append(f"{family.ljust(wide)}{level:>5}{numbers}  {cause} ({times})")
         (family, layer), count = Counter((d.family, d.layer) for d in mine).most_common(1)[0]
         points = f"{100 * count / total:.1f} points of success"
         lines.append(f"most is to be won in {family}, by {layer}: {points}")

@@ -235,7 +235,7 @@ def trajectories(folder: Path, out: Path) -> None:
     figure, axes = plt.subplots(
         len(hardest),
         columns,
-        figsize=(1.6 + 2.1 * columns, 0.4 + 2.2 * len(hardest)),
+        figsize=(1.6 + 2.1 * columns, 0.9 + 2.3 * len(hardest)),
         sharex=True,
         sharey=True,
         squeeze=False,
