@@ -227,10 +227,8 @@ def print_table(summary: dict[str, Any]) -> None:
                 cells = "".join(f"{100 * families[name][lv]['rate']:7.1f}%" for lv in levels)
                 print(name.ljust(wide) + cells)
             mean = families["mean"]
-            low, high = 100 * mean["ci_low"], 100 * mean["ci_high"]
-            print(
-                f"{'mean'.ljust(wide)}{100 * mean['rate']:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}"
-            )
+            rate, low, high = (100 * mean[key] for key in ("rate", "ci_low", "ci_high"))
+            print(f"{'mean'.ljust(wide)}{rate:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}")
 
 
 def run_tracking(low: Policy, args: argparse.Namespace) -> int:
