@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.evaluation import Episode, tile_of
+from tdgc.evaluation import Episode, EpisodeRecord, tile_of
 from tdgc.robot import HIPS_XY, Array
 from tdgc.terrain import (
     GOAL_BEGIN,
@@ -77,11 +77,10 @@ LIMITS: dict[str, Limit] = {
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(EpisodeRecord):
     """A failed episode's row of diagnosis.csv.
 
     Attributes:
-        policy, condition, family, level, episode, seed, outcome: as in episodes.csv.
         time_s: s, when it ended.
         place: where on the tile: a platform, a transition or the zone.
         feature: the nearest trench, step or pillar and how far it is from the trunk; or empty.
@@ -90,13 +89,6 @@ class Diagnosis:
         evidence: the numbers that say so.
     """
 
-    policy: str
-    condition: str
-    family: str
-    level: int
-    episode: int
-    seed: int
-    outcome: str
     time_s: float
     place: str
     feature: str

@@ -94,13 +94,27 @@ class Cell:
     count: int
 
 
-def episode_name(policy: str, condition: str, family: str, level: int, episode: int) -> str:
-    """A name for an episode's files, a different one for each of an evaluation."""
-    return f"{policy}_{condition}_{file_label(family)}_{level:02d}_{episode:03d}"
+@dataclass(frozen=True, eq=False)
+class EpisodeRecord:
+    """What every record of an episode begins with: which one it was, and one of ``OUTCOMES``."""
+
+    policy: str
+    condition: str
+    family: str
+    level: int
+    episode: int
+    seed: int
+    outcome: str
+
+    @property
+    def name(self) -> str:
+        """A name for the episode's files, a different one for each of an evaluation."""
+        where = f"{self.policy}_{self.condition}_{file_label(self.family)}"
+        return f"{where}_{self.level:02d}_{self.episode:03d}"
 
 
 @dataclass(frozen=True, eq=False)
-class Episode:
+class Episode(EpisodeRecord):
     """A row of episodes.csv, and where the robot went.
 
     Attributes:
@@ -111,13 +125,6 @@ class Episode:
             the start and once more at the end.
     """
 
-    policy: str
-    condition: str
-    family: str
-    level: int
-    episode: int
-    seed: int
-    outcome: str
     time_s: float
     path_m: float
     energy_j: float

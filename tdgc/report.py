@@ -28,7 +28,7 @@ from tdgc.evaluation import (
     OUTCOMES,
     PUSH_INTERVAL,
     Condition,
-    episode_name,
+    EpisodeRecord,
 )
 from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE
 from tdgc.terrain import file_label
@@ -223,9 +223,10 @@ def _tuning(path: Path) -> dict[str, Any] | None:
 
 
 def film_stem(row: Row) -> str:
-    """The ``episode_name`` of a row of episodes.csv or diagnosis.csv."""
-    level, episode = int(row["level"]), int(row["episode"])
-    return episode_name(row["policy"], row["condition"], row["family"], level, episode)
+    """The name of the films of a row of episodes.csv or diagnosis.csv."""
+    level, episode, seed = (int(row[key]) for key in ("level", "episode", "seed"))
+    where = row["policy"], row["condition"], row["family"]
+    return EpisodeRecord(*where, level, episode, seed, row["outcome"]).name
 
 
 def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> Film:
