@@ -44,7 +44,7 @@ from tdgc.high_env import PRETRAINED, load_low
 from tdgc.policies import Policy
 from tdgc.recording import Recorder, Recording, Together
 from tdgc.teacher import STYLES
-from tdgc.terrain import ALL_FAMILIES, FAMILIES, OOD_LEVELS
+from tdgc.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
 from tdgc.trace import Selection, Trace, Tracer, check_installed, write
 from tdgc.tuning import TunedDriver, Tuning
 from tdgc.worker import WorkerError
@@ -59,7 +59,11 @@ SHIPPED_HIGH = PRETRAINED / "high"
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
-    parser.add_argument("--families", default="all", help=f"all, or of {', '.join(ALL_FAMILIES)}")
+    parser.add_argument(
+        "--families",
+        default="all",
+        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING}",
+    )
     parser.add_argument("--episodes", type=int, default=100, help="a cell (100)")
     parser.add_argument(
         "--policies",
@@ -220,13 +224,14 @@ def print_table(summary: dict[str, Any]) -> None:
             print(f"\n{policy}, {condition}")
             names = [f for f in families if f != "mean"]
             levels = list(families[names[0]])
-            print("family  " + "".join(f"{level:>8}" for level in levels))
+            wide = max(8, *(len(name) + 1 for name in names))
+            print("family".ljust(wide) + "".join(f"{level:>8}" for level in levels))
             for name in names:
                 cells = "".join(f"{100 * families[name][lv]['rate']:7.1f}%" for lv in levels)
-                print(f"{name:<8}{cells}")
+                print(name.ljust(wide) + cells)
             mean = families["mean"]
-            low, high = 100 * mean["ci_low"], 100 * mean["ci_high"]
-            print(f"mean    {100 * mean['rate']:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}")
+            rate, low, high = (100 * mean[key] for key in ("rate", "ci_low", "ci_high"))
+            print(f"{'mean'.ljust(wide)}{rate:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}")
 
 
 def run_tracking(low: Policy, args: argparse.Namespace) -> int:
@@ -341,12 +346,18 @@ def main(arguments: list[str] | None = None) -> int:
     high = args.high or (SHIPPED_HIGH if shipped else None)
     try:
         levels = choose_levels(args.levels)
-        families = choose(args.families, ALL_FAMILIES, FAMILIES, "family")
+        maps = tuple(name for name in args.families.split(",") if is_map(name))
+        families = choose(args.families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
+        for name in maps:
+            height_map(name)
         default = "gp" if high is None else "all"
         names = choose(args.policies or default, (*POLICIES, TEACHER), POLICIES, "policy")
         conditions = choose(args.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition")
-        if TEACHER in names and "mixed" in (*families, *conditions):
-            raise ValueError(f"the {TEACHER} knows {', '.join(STYLES)}; it cannot lead on mixed")
+        met = (*families, *(name for name in conditions if name in ALL_FAMILIES))
+        if TEACHER in names and not set(met) <= set(STYLES):
+            strange = next(name for name in met if name not in STYLES)
+            known = ", ".join(STYLES)
+            raise ValueError(f"the {TEACHER} knows {known}; it cannot lead on {strange}")
         if args.gui is not None and args.cluster is not None:
             raise ValueError("--gui shows a robot of this machine: no --cluster")
         cores = usable_cores() if args.cluster is None else cluster.connect(args.cluster)

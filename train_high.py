@@ -25,6 +25,8 @@ from tdgc.high_env import NavigationTask, check_pair, load_low, summarise
 from tdgc.imitation import Apprentice, ApprenticePolicy
 from tdgc.policies import Policy
 from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.teacher import check_styles
+from tdgc.tiles import check_families
 from tdgc.training import Phase, add_arguments, configure, run
 from tdgc.vec import TaskVecEnv
 from tdgc.worker import MakeLink, WorkerError
@@ -121,6 +123,9 @@ def main(arguments: list[str] | None = None) -> int:
         config = configure(HighTrainConfig(), args)
         low, low_config = load_low(config.low)
         check_pair(config.env, low_config)
+        check_families(config.env.families)
+        if config.imitation.steps:
+            check_styles(config.env.families)
         meta: dict[str, Any] = {
             "config": to_dict(config.env),
             "low": {"config": to_dict(low_config), "observation": low.actor_dim},

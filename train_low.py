@@ -20,6 +20,7 @@ from tdgc import __version__, plots, policies
 from tdgc.config import LowLevelConfig, LowTrainConfig, to_dict
 from tdgc.low_env import LowLevelTask, summarise
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
+from tdgc.tiles import check_families
 from tdgc.training import Phase, add_arguments, configure, run
 from tdgc.vec import TaskVecEnv
 from tdgc.worker import MakeLink, WorkerError
@@ -104,6 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     try:
         config = configure(LowTrainConfig(), args)
+        check_families(config.env.families)
         meta = {"config": to_dict(config.env), "seed": config.seed, "code": __version__}
         run(args, config, phases(config, args.device), meta, summarise)
     except ValueError as error:

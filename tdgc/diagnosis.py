@@ -22,10 +22,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.evaluation import Episode, tile_of
+from tdgc.evaluation import Episode, EpisodeRecord, tile_of
 from tdgc.robot import Array
 from tdgc.terrain import (
-    FAMILIES,
     GOAL_BEGIN,
     HALF_ZONES,
     MAX_LEVEL,
@@ -78,11 +77,10 @@ LIMITS: dict[str, Limit] = {
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(EpisodeRecord):
     """A failed episode's row of diagnosis.csv.
 
     Attributes:
-        policy, condition, family, level, episode, seed, outcome: as in episodes.csv.
         time_s: s, when it ended.
         place: where on the tile: a platform, a transition or the zone.
         feature: the nearest trench, step or pillar and how far it is from the trunk; or empty.
@@ -91,13 +89,6 @@ class Diagnosis:
         evidence: the numbers that say so.
     """
 
-    policy: str
-    condition: str
-    family: str
-    level: int
-    episode: int
-    seed: int
-    outcome: str
     time_s: float
     place: str
     feature: str
@@ -156,7 +147,7 @@ def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
     towards = asked_towards(trace, intervals)
     evidence = _evidence(trace, intervals, errors, limits, towards)
     down = trace.outcome == "fell" or (trace.outcome == "collided" and not held[-1])
-    if trace.family not in FAMILIES or trace.level > MAX_LEVEL:
+    if trace.family == "mixed" or trace.level > MAX_LEVEL:
         return "terrain", "never trained on", evidence
     if lost:
         return "execution", f"lost track of {' and '.join(lost)}", evidence
@@ -334,13 +325,14 @@ def describe(diagnoses: Sequence[Diagnosis], episodes: Sequence[Episode]) -> str
         if not mine:
             continue
         head = "".join(f"{layer:>11}" for layer in LAYERS)
-        lines.append(f"family  level{head}  commonest cause")
+        wide = max(8, *(len(d.family) + 1 for d in mine))
+        lines.append(f"{'family'.ljust(wide)}level{head}  commonest cause")
         for family, level in dict.fromkeys((d.family, d.level) for d in mine):
             cell = [d for d in mine if (d.family, d.level) == (family, level)]
             counts = Counter(d.layer for d in cell)
             numbers = "".join(f"{counts[layer]:>11}" for layer in LAYERS)
             cause, times = Counter(d.cause for d in cell).most_common(1)[0]
-            lines.append(f"{family:<8}{level:>5}{numbers}  {cause} ({times})")
+            lines.append(f"{family.ljust(wide)}{level:>5}{numbers}  {cause} ({times})")
         (family, layer), count = Counter((d.family, d.layer) for d in mine).most_common(1)[0]
         points = f"{100 * count / total:.1f} points of success"
         lines.append(f"most is to be won in {family}, by {layer}: {points}")

@@ -29,7 +29,16 @@ from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE, is_fallen
 from tdgc.policies import Policy
 from tdgc.rewards import CONTACT_FORCE
 from tdgc.robot import NUM_JOINTS, Array, RobotState
-from tdgc.terrain import ALL_FAMILIES, EVAL_STREAM, MAX_LEVEL, Tile, TileField, make_tile, tile_rng
+from tdgc.terrain import (
+    EVAL_STREAM,
+    MAX_LEVEL,
+    Tile,
+    TileField,
+    family_number,
+    file_label,
+    make_tile,
+    tile_rng,
+)
 from tdgc.worker import keep_memory, one_blas_thread
 
 HORIZON = 20.0  # s (benchmark)
@@ -86,7 +95,26 @@ class Cell:
 
 
 @dataclass(frozen=True, eq=False)
-class Episode:
+class EpisodeRecord:
+    """What every record of an episode begins with: which one it was, and one of ``OUTCOMES``."""
+
+    policy: str
+    condition: str
+    family: str
+    level: int
+    episode: int
+    seed: int
+    outcome: str
+
+    @property
+    def name(self) -> str:
+        """A name for the episode's files, a different one for each of an evaluation."""
+        where = f"{self.policy}_{self.condition}_{file_label(self.family)}"
+        return f"{where}_{self.level:02d}_{self.episode:03d}"
+
+
+@dataclass(frozen=True, eq=False)
+class Episode(EpisodeRecord):
     """A row of episodes.csv, and where the robot went.
 
     Attributes:
@@ -97,13 +125,6 @@ class Episode:
             the start and once more at the end.
     """
 
-    policy: str
-    condition: str
-    family: str
-    level: int
-    episode: int
-    seed: int
-    outcome: str
     time_s: float
     path_m: float
     energy_j: float
@@ -143,7 +164,7 @@ def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
 
 def push_velocities(cell: Cell, seed: int, speed: float, pushes: int) -> Array:
     """Push k of each episode, (count, pushes, 3) m/s: the same for every policy."""
-    family = ALL_FAMILIES.index(cell.family)
+    family = family_number(cell.family)
     result = np.zeros((cell.count, pushes, 3))
     for k in range(cell.count):
         entropy = (EVAL_STREAM, seed, family, cell.level, cell.first + k, 1)

@@ -30,7 +30,7 @@ from tdgc.low_env import GOAL_RADIUS
 from tdgc.plots import GAIT_COLOURS, POLICY_COLOURS, sheet
 from tdgc.recording import Recording, spans, stretches
 from tdgc.robot import Array
-from tdgc.terrain import TILE_SIZE, Tile, TileField
+from tdgc.terrain import TILE_SIZE, Tile, TileField, file_label
 from tdgc.world import Stage
 
 FRAME_SECONDS = 0.04  # 25 frames a second: every second control step
@@ -394,7 +394,7 @@ def strip(recordings: Sequence[Recording], folder: Path) -> Path:
                 time = f"{(i + 1) * r.dt:.1f} s"
                 draw.text((x + _SHOT[0] - 36, y + 19), time, _INK, _font(14), "mm")
     suffix = "" if first.condition == "nominal" else f"_{first.condition}"
-    path = folder / f"strip_{first.family}_{first.level}{suffix}.png"
+    path = folder / f"strip_{file_label(first.family)}_{first.level}{suffix}.png"
     partial = path.with_suffix(f".{os.getpid()}.tmp")
     try:
         image.save(partial, format="PNG")

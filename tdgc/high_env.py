@@ -525,7 +525,8 @@ def summarise(sums: dict[str, float]) -> dict[str, float]:
     for key, value in sums.items():
         if key.startswith("term/"):
             values[f"reward/{key[5:]}"] = value / steps
-    families = [k.split("/")[1] for k in sums if k.startswith("family/") and k.endswith("/count")]
+    counts = [k for k in sums if k.startswith("family/") and k.endswith("/count")]
+    families = [k.removeprefix("family/").removesuffix("/count") for k in counts]
     for family in families:
         count = max(sums[f"family/{family}/count"], 1.0)
         values[f"level/{family}"] = sums[f"family/{family}/level"] / count

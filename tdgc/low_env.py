@@ -705,7 +705,8 @@ def summarise(sums: dict[str, float]) -> dict[str, float]:
         values[f"tracking/{gait}_velocity_rmse"] = (sums.get(f"gait/{gait}/lin", 0.0) / n) ** 0.5
         values[f"tracking/{gait}_yaw_rate_rmse"] = (sums.get(f"gait/{gait}/yaw", 0.0) / n) ** 0.5
         values[f"tracking/{gait}_contact_match"] = sums.get(f"gait/{gait}/match", 0.0) / n
-    families = [k.split("/")[1] for k in sums if k.startswith("level/") and k.endswith("/count")]
+    counts = [k for k in sums if k.startswith("level/") and k.endswith("/count")]
+    families = [k.removeprefix("level/").removesuffix("/count") for k in counts]
     for family in families:
         count = max(sums[f"level/{family}/count"], 1.0)
         values[f"level/{family}"] = sums[f"level/{family}/level"] / count

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tdgc.config import RobotConfig
 from tdgc.drivers import Driver
-from tdgc.evaluation import OUTCOMES, Cell, Watcher
+from tdgc.evaluation import OUTCOMES, Cell, EpisodeRecord, Watcher
 from tdgc.locomotion import Locomotion
 from tdgc.rewards import CONTACT_FORCE
 from tdgc.robot import Array
@@ -21,11 +21,10 @@ from tdgc.terrain import TileField
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(EpisodeRecord):
     """One episode; row i of the arrays is the robot after control step i of n.
 
     Attributes:
-        policy, condition, family, level, episode, seed, outcome: as in episodes.csv.
         robot: what robot it was.
         dt: s, a control step.
         bounds: (12, 2) what its continuous commands stayed within.
@@ -37,13 +36,6 @@ class Recording:
         contact, desired: (n, 4) feet in contact, and whether the gait desired it.
     """
 
-    policy: str
-    condition: str
-    family: str
-    level: int
-    episode: int
-    seed: int
-    outcome: str
     robot: RobotConfig
     dt: float
     bounds: Array
@@ -55,12 +47,6 @@ class Recording:
     height: Array
     contact: NDArray[np.bool_]
     desired: NDArray[np.bool_]
-
-    @property
-    def name(self) -> str:
-        """A name for its files, a different one for each episode of an evaluation."""
-        where = f"{self.policy}_{self.condition}_{self.family}"
-        return f"{where}_{self.level:02d}_{self.episode:03d}"
 
     @property
     def ending(self) -> str:

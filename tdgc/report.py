@@ -22,8 +22,16 @@ import jinja2
 
 import tdgc
 from tdgc.diagnosis import LAYERS
-from tdgc.evaluation import CONDITIONS, HORIZON, OUTCOMES, PUSH_INTERVAL, Condition
+from tdgc.evaluation import (
+    CONDITIONS,
+    HORIZON,
+    OUTCOMES,
+    PUSH_INTERVAL,
+    Condition,
+    EpisodeRecord,
+)
 from tdgc.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE
+from tdgc.terrain import file_label
 
 NAME = "report.html"
 #: Bytes of films in a page, a choice: ten of 2 MB each, the size of an MP4 of a whole episode. What
@@ -215,9 +223,10 @@ def _tuning(path: Path) -> dict[str, Any] | None:
 
 
 def film_stem(row: Row) -> str:
-    """The name that ``tdgc.recording.Recording`` gives an episode of episodes.csv."""
-    where = f"{row['policy']}_{row['condition']}_{row['family']}"
-    return f"{where}_{int(row['level']):02d}_{int(row['episode']):03d}"
+    """The name of the films of a row of episodes.csv or diagnosis.csv."""
+    level, episode, seed = (int(row[key]) for key in ("level", "episode", "seed"))
+    where = row["policy"], row["condition"], row["family"]
+    return EpisodeRecord(*where, level, episode, seed, row["outcome"]).name
 
 
 def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> Film:
@@ -257,7 +266,7 @@ def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> l
                 if film.file and film.uri:
                     room -= (folder / film.file).stat().st_size
         suffix = "" if first["condition"] == "nominal" else f"_{first['condition']}"
-        strip = folder / f"strip_{family}_{first['level']}{suffix}.png"  # of episode 0
+        strip = folder / f"strip_{file_label(family)}_{first['level']}{suffix}.png"  # of episode 0
         shown = first["episode"] == "0" and strip.is_file()
         tiles.append({**first, "films": films, "strip": data_uri(strip) if shown else None})
     return tiles

@@ -121,6 +121,20 @@ def travel_cost(
             return cost[inside].copy(), step, left
 
 
+def check_styles(families: Sequence[str]) -> None:
+    """See that there is a style for each of the families.
+
+    Raises:
+        ValueError: there is none for one of them.
+    """
+    for family in families:
+        if family not in STYLES:
+            raise ValueError(
+                f"the teacher does not know {family}, only {', '.join(STYLES)}; "
+                "imitation.steps=0 does without it"
+            )
+
+
 class Teacher:
     """Commands robots on tiles of their own.
 
@@ -133,9 +147,7 @@ class Teacher:
     """
 
     def __init__(self, field: TileField, families: Sequence[str]) -> None:
-        for family in families:
-            if family not in STYLES:
-                raise ValueError(f"the teacher does not know {family}, only {', '.join(STYLES)}")
+        check_styles(families)
         m = len(families)
         self._field = field
         self._origin = field.origin(np.arange(m), 0)

@@ -12,7 +12,10 @@ shapes are those of TDGC-Bench. All lengths are in m, all angles in rad; arrays 
 
 from __future__ import annotations
 
+import functools
 import math
+import re
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -26,6 +29,8 @@ HeightArray = NDArray[np.float32]
 # Families and levels: Sec. III-A; Mixed and the levels past 10 are only ever evaluated on.
 FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
 ALL_FAMILIES = (*FAMILIES, "mixed")
+#: A family whose name ends so is a file with heights of the user's own, see `height_map`.
+MAP_ENDING = ".npy"
 MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1
 OOD_LEVELS = (11, 12)  # out of distribution, d = 1.1 and 1.2
 MAX_DIFFICULTY = OOD_LEVELS[-1] / MAX_LEVEL
@@ -137,7 +142,8 @@ def difficulty_parameter(family: str, difficulty: float) -> float:
 
     Mixed has none of its own: each of its halves uses its family's.
     """
-    _check_family(family, FAMILIES)
+    if family not in FAMILIES:
+        raise ValueError(f"{family!r} has no parameter; choose from {', '.join(FAMILIES)}")
     _check_difficulty(difficulty)
     p_min, p_max = PARAMETER_RANGES[family]
     return p_min + difficulty * (p_max - p_min)
@@ -161,13 +167,13 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
     Parameters
     ----------
     family : str
-        One of `ALL_FAMILIES`.
+        One of `ALL_FAMILIES`, or the path of a height map, whose heights are multiplied by d.
     difficulty : float
         d in [0, 1.2]: level / 10; the curriculum ends at 1.
     rng : numpy Generator
         The only source of chance: the same state gives the same tile.
     """
-    _check_family(family, ALL_FAMILIES)
+    check_family(family)
     _check_difficulty(difficulty)
     start, goal = draw_start_goal(rng)
     parts: tuple[str, ...] = (family,)
@@ -179,7 +185,10 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
     heights = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
     support = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
     for part, section in zip(parts, sections, strict=True):
-        relief = _SURFACES[part](section, difficulty_parameter(part, difficulty), rng)
+        if is_map(part):
+            relief = difficulty * _blend(section, BAND)[:, None] * height_map(part)
+        else:
+            relief = _SURFACES[part](section, difficulty_parameter(part, difficulty), rng)
         heights += relief
         if part not in _ON_FLAT_BASE:
             support += relief
@@ -275,6 +284,44 @@ def tilt(section: Section, angle: float, rng: np.random.Generator) -> FloatArray
     return _blend(section, TILT_BAND)[:, None] * slope
 
 
+def is_map(family: str) -> bool:
+    """Whether a family is a file with heights of the user's own."""
+    return family.endswith(MAP_ENDING)
+
+
+@functools.lru_cache
+def height_map(path: str) -> FloatArray:
+    """Heights (161, 161) in m of a file, those of the zone at difficulty 1; the platforms are flat.
+
+    Raises:
+        ValueError: no such file, or one that holds something else.
+    """
+    try:
+        heights = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"terrain '{path}' cannot be read as a NumPy file: {error}") from error
+    shape = (TILE_SAMPLES, TILE_SAMPLES)
+    real = isinstance(heights, np.ndarray) and heights.dtype.kind in "fiu"
+    if not real or heights.shape != shape or not np.isfinite(heights).all():
+        raise ValueError(f"terrain '{path}' must hold finite heights in m, an array {shape}")
+    limit = HEIGHT_RANGE[1] / MAX_DIFFICULTY
+    if np.abs(heights).max() > limit:
+        raise ValueError(f"terrain '{path}' must stay within {limit:g} m of the platforms' height")
+    return heights.astype(np.float64)
+
+
+def family_number(family: str) -> int:
+    """A number of each family's own, below 2**32: part of the seeds of its tiles."""
+    if is_map(family):
+        return zlib.crc32(height_map(family).tobytes()) | 2**31  # above those of ALL_FAMILIES
+    return ALL_FAMILIES.index(family)
+
+
+def file_label(family: str) -> str:
+    """A family's name as a part of a file's name."""
+    return re.sub(r"[^\w.-]", "-", family)
+
+
 def place_pillars(section: Section, count: int, rng: np.random.Generator) -> FloatArray:
     """Centres and diameters (count, 3) in m of cylinders that keep their clearance.
 
@@ -313,8 +360,8 @@ def tile_rng(
     seed: int, family: str, level: int, index: int, stream: int = TRAIN_STREAM
 ) -> np.random.Generator:
     """Generator of tile number `index` of a family and level; streams and tiles never share one."""
-    _check_family(family, ALL_FAMILIES)
-    entropy = (stream, int(seed), ALL_FAMILIES.index(family), int(level), int(index))
+    check_family(family)
+    entropy = (stream, int(seed), family_number(family), int(level), int(index))
     # Numbers of more than 32 bits would take two words and could then run into their neighbours.
     if not all(0 <= number < 2**32 for number in entropy):
         raise ValueError(f"stream, seed, level and index must lie in [0, 2**32), got {entropy}")
@@ -410,7 +457,7 @@ class TerrainGrid(TileField):
         self.levels, self.families = tuple(levels), tuple(families)
         self.seed, self.stream = seed, stream
         for family in self.families:
-            _check_family(family, ALL_FAMILIES)
+            check_family(family)
         if not all(level in range(OOD_LEVELS[-1] + 1) for level in self.levels):
             raise ValueError(
                 f"levels must be whole numbers from 0 to {OOD_LEVELS[-1]}, got {self.levels}"
@@ -486,9 +533,17 @@ def _sample(x: float) -> int:
     return round(x / CELL)
 
 
-def _check_family(family: str, allowed: Sequence[str]) -> None:
-    if family not in allowed:
-        raise ValueError(f"unknown terrain family {family!r}; choose from {', '.join(allowed)}")
+def check_family(family: str, beside: Sequence[str] = ()) -> None:
+    """See that a tile of the family can be made; those ``beside`` are allowed, too.
+
+    Raises:
+        ValueError: an unknown name, or a height map that cannot be used.
+    """
+    if is_map(family):
+        height_map(family)
+    elif family not in (*ALL_FAMILIES, *beside):
+        allowed = ", ".join((*beside, *ALL_FAMILIES, f"FILE{MAP_ENDING}"))
+        raise ValueError(f"unknown terrain family {family!r}; choose from {allowed}")
 
 
 def _check_difficulty(difficulty: float) -> None:

@@ -17,6 +17,7 @@ from tdgc.terrain import (
     TRAIN_STREAM,
     Tile,
     TileField,
+    check_family,
     make_tile,
     tile_rng,
 )
@@ -28,6 +29,16 @@ FLAT = "flat"
 # Episodes on one tile while the level stays. A tile met too often is learned by heart, and to bring
 # a new one into Bullet takes 80 ms, a third of a decision of 50 robots: at 5, one percent in all.
 _EPISODES = 5
+
+
+def check_families(families: Sequence[str]) -> None:
+    """See that tiles of the families can be made.
+
+    Raises:
+        ValueError: an unknown name, or a height map that cannot be used.
+    """
+    for family in families:
+        check_family(family, (FLAT,))
 
 
 class TrainingTiles:

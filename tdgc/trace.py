@@ -25,7 +25,7 @@ from tdgc import rewards
 from tdgc.commands import CONTINUOUS, INDEX, NAMES, NUM_ACTIONS, UNITS, CommandDecoder, gait_index
 from tdgc.drivers import Driver
 from tdgc.errors import InputError, install_hint
-from tdgc.evaluation import OUTCOMES, Cell, joint_power
+from tdgc.evaluation import OUTCOMES, Cell, EpisodeRecord, joint_power
 from tdgc.gaits import FEET, GAITS
 from tdgc.high_env import PROBES, SEMANTIC, command_share, height_probes, high_step
 from tdgc.locomotion import Locomotion
@@ -105,22 +105,14 @@ _DECIDED = (*_ACTIONS, *_COMMANDS, "gait", *_AT_BOUND)
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class Trace(EpisodeRecord):
     """One episode's trace.
 
     Attributes:
-        policy, condition, family, level, episode, seed, outcome: as in episodes.csv.
         columns: name -> (n,) float32, or str and None in columns of names; n - 1 decisions and the
             end. NaN stands for null.
     """
 
-    policy: str
-    condition: str
-    family: str
-    level: int
-    episode: int
-    seed: int
-    outcome: str
     columns: dict[str, NDArray[Any]]
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -128,9 +120,8 @@ class Trace:
 
     @property
     def file_name(self) -> str:
-        """Its file's name, a different one for each episode of an evaluation."""
-        where = f"{self.policy}_{self.condition}_{self.family}"
-        return f"{where}_{self.level:02d}_{self.episode:03d}.parquet"
+        """Its file's name."""
+        return f"{self.name}.parquet"
 
 
 _META = tuple(f for f in dataclasses.fields(Trace) if f.name != "columns")

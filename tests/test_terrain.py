@@ -94,6 +94,48 @@ def test_same_seed_same_tile(family):
         assert (one.heights != other.heights).any()
 
 
+def test_a_tile_of_a_height_map(tmp_path):
+    """The file's heights times the difficulty in the zone, blended in over 25 cm."""
+    x = np.arange(161) / 20
+    heights = 0.5 + 0.1 * x[:, None] - 0.05 * x
+    name = str(tmp_path / "ramp.npy")
+    np.save(name, heights)
+    made = tile(name, 0.4)
+    assert made.family == name and made.parts == (name,)
+    np.testing.assert_allclose(made.heights[30:131], 0.4 * heights[30:131], atol=1e-6)
+    np.testing.assert_allclose(made.heights[28], 0.4 * 0.6 * heights[28], atol=1e-6)  # 0.15 of 0.25
+    assert (made.heights[:26] == 0.0).all() and (made.heights[135:] == 0.0).all()
+    np.testing.assert_array_equal(made.support, made.heights)
+    starts = [make_tile(f, 1.0, tile_rng(0, f, 10, 0)).start[1] for f in (name, "rough")]
+    assert starts[0] != starts[1]
+    assert make_tile(name, 1.0, tile_rng(0, name, 10, 0)).start[1] == starts[0]
+    assert terrain.file_label("maps/my hills.npy") == "maps-my-hills.npy"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "cannot be read as a NumPy file"),
+        (b"no array", "cannot be read as a NumPy file"),
+        (np.zeros((161, 160)), r"must hold finite heights in m, an array \(161, 161\)$"),
+        (np.full((161, 161), np.nan), "must hold finite heights"),
+        (np.zeros((161, 161), dtype=bool), "must hold finite heights"),
+        (np.array([{}], dtype=object), "cannot be read as a NumPy file: .*allow_pickle"),
+        (np.full((161, 161), -1.8), r"must stay within 1\.75 m of the platforms' height$"),
+    ],
+    ids=["none", "text", "shape", "nan", "bool", "pickle", "deep"],
+)
+def test_a_height_map_that_cannot_be_used(content, message, tmp_path):
+    path = tmp_path / "map.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        np.save(path, content, allow_pickle=True)
+    with pytest.raises(ValueError, match=message) as caught:
+        tile(str(path), 1.0)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
 def test_a_tile_is_frozen():
     with pytest.raises(FrozenInstanceError):
         tile("rough", 0).family = "stair"
@@ -108,9 +150,9 @@ def test_bad_difficulty_names_the_range(difficulty):
 
 
 def test_bad_family_names_the_families():
-    with pytest.raises(ValueError, match=r"'stairs'; choose from rough, pillar, .*, mixed$"):
+    with pytest.raises(ValueError, match=r"'stairs'; choose from rough, .*, mixed, FILE\.npy$"):
         tile("stairs", 0.5)
-    with pytest.raises(ValueError, match=r"'mixed'; choose from rough, .*, tilt$"):
+    with pytest.raises(ValueError, match=r"'mixed' has no parameter; choose from rough, .*, tilt$"):
         difficulty_parameter("mixed", 0.5)
 
 

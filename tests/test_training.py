@@ -533,6 +533,11 @@ def test_flags_and_folders_that_cannot_be_used(
         "unknown configuration key 'env.robot.kq'": ["--set", "env.robot.kq=1"],
         "cannot read --set 'seed'": ["--set", "seed"],
         "not a JSON file": ["--resume", "--out", str(damaged)],
+        "unknown terrain family 'sand'; choose from flat, rough, ": [
+            "--set",
+            'env.families=["sand"]',
+        ],
+        "terrain 'no.npy' cannot be read as a NumPy": ["--set", 'env.families=["flat","no.npy"]'],
     }
     for message, arguments in cases.items():
         where = [] if "--out" in arguments else ["--out", str(empty)]
@@ -540,6 +545,13 @@ def test_flags_and_folders_that_cannot_be_used(
         error = capsys.readouterr().err
         assert error.startswith("train_low.py: ") and message in error
         assert error.count("\n") == 1
+    for families, message in (
+        ("mixed", "the teacher does not know mixed, only rough, "),
+        ("sand", "unknown terrain family 'sand'; choose from flat, rough, "),
+    ):
+        flags = ["--set", f'env.families=["{families}"]', "--out", str(empty)]
+        assert train_high.main(flags) == 2
+        assert capsys.readouterr().err.startswith(f"train_high.py: {message}")
     assert not empty.exists()
 
 
