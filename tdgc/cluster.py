@@ -15,6 +15,7 @@ import os
 import re
 import signal
 import socket
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -29,6 +30,9 @@ from tdgc.worker import BLAS_THREADS, Arrays, MakeTask, Worker, WorkerError, kee
 _REACH_SECONDS = 5.0  # to be let in by the cluster
 _JOIN_SECONDS = 120.0  # for every node to start a Python and import this package
 _RERUNS = 3  # of a job whose node was lost
+# Of a worker that was lost before it said a word: for some seconds Ray still sends workers to a
+# node that is gone.
+_RESTARTS, _PAUSE_SECONDS = 10, 1.0
 
 #: Of the flag ``--cluster``.
 CLUSTER_HELP = (
@@ -194,11 +198,17 @@ class ActorLink:
         seed: int,
         state: State | None,
     ) -> None:
-        import ray
-
         self._worker = worker
         self._views = {name: view[rows] for name, view in arrays.views().items()}
         self._pid, self._place = 0, "no node yet"
+        self._beginning = make_task, seed, state
+        self._restarts = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        import ray
+
+        make_task, seed, state = self._beginning
         self._actor = (
             ray.remote(_Actor)
             .options(num_cpus=1, max_restarts=0, scheduling_strategy="SPREAD")
@@ -228,6 +238,11 @@ class ActorLink:
             plain = re.sub(r"\x1b\[\d+m", "", str(error))  # without colours
             raise WorkerError(f"{name} failed:\n{plain}") from None
         except ray.exceptions.RayError as error:
+            if not self._pid and self._restarts < _RESTARTS:
+                self._restarts += 1
+                time.sleep(_PAUSE_SECONDS)
+                self._begin()
+                return self.receive(timeout)
             kind = type(error).__name__
             raise WorkerError(f"{name} was lost with {self._place} ({kind})") from None
         self._place = f"process {self._pid} on {address}"

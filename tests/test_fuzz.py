@@ -254,8 +254,8 @@ def test_any_configuration_of_a_run(folder: Path, content: bytes | Damage) -> No
     good = json.dumps(to_dict(LowTrainConfig())).encode()
     data = content if isinstance(content, bytes) else damaged(good, content)
     (run / "config.json").write_bytes(data)
-    flags = {"seed": None, "n_envs": None, "workers": None, "steps": None, "assignments": []}
-    args = Namespace(out=run, resume=True, **flags)
+    flags = dict.fromkeys(("seed", "n_envs", "workers", "steps", "cluster"))
+    args = Namespace(out=run, resume=True, assignments=[], **flags)
     found = answer(lambda: training.configure(LowTrainConfig(), args), ConfigError)
     if found is not None:
         check_config(found)
