@@ -30,7 +30,10 @@ from tdgc.worker import WorkerError
 
 TESTS = Path(__file__).resolve().parent
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+pytestmark = [
+    pytest.mark.skipif(sys.platform != "linux", reason="/proc"),
+    pytest.mark.usefixtures("signals"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +65,6 @@ def joined(nodes: Cluster) -> Cluster:
     while connect("auto") != 4:  # those lost before are still counted for some seconds
         time.sleep(0.1)
     return nodes
-
-
-@pytest.fixture(autouse=True)
-def signals() -> Iterator[None]:
-    """Runs take over SIGINT and SIGTERM; give them back."""
-    before = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)]
-    yield
-    for number, handler in before:
-        signal.signal(number, handler)
 
 
 def raylet(node: Any) -> int:

@@ -46,14 +46,7 @@ from tdgc.vec import worker_seed
 
 ROOT = Path(__file__).resolve().parents[1]
 
-
-@pytest.fixture(autouse=True)
-def signals() -> Iterator[None]:
-    """Runs take over SIGINT and SIGTERM; give them back."""
-    before = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)]
-    yield
-    for number, handler in before:
-        signal.signal(number, handler)
+pytestmark = pytest.mark.usefixtures("signals")
 
 
 # ------------------------------------------------------------------ checkpoints

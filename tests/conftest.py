@@ -1,0 +1,15 @@
+"""What tests of more than one file need."""
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Runs take over SIGINT and SIGTERM; give them back."""
+    before = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)]
+    yield
+    for number, handler in before:
+        signal.signal(number, handler)
