@@ -49,7 +49,7 @@ class Geometry:
         abduction: m, from the hip joint out to the thigh joint.
         thigh, calf: m, from the thigh joint to the calf joint, and on to the foot's centre.
         foot_radius: m.
-        trunk_mass: kg.
+        trunk_mass: kg, without what is fixed to the trunk by joints.
         joint_limits: lowest and highest angle of each joint, (12, 2) rad.
     """
 
@@ -107,13 +107,11 @@ def _parse(text: str) -> Element:
 
 
 def _measure(robot: Element) -> Geometry:
-    joints = _joints(robot)
-    links = _links(robot, joints)
-    trunk = links[_link_of(joints["FL_hip_joint"], "parent")]
-    _check_trunk(trunk)
+    joints, fixed = _joints(robot)
+    parts = _parts(robot, joints, fixed)
     origins = np.stack([_origin(joints[name]) for name in JOINTS]).reshape(4, 3, 3)
     limits = np.stack([_limits(joints[name]) for name in JOINTS]).reshape(4, 3, 2)
-    feet = np.stack([_foot(links[_link_of(joints[f"{leg}_calf_joint"], "child")]) for leg in FEET])
+    feet = np.stack([_foot(parts[_link_of(joints[f"{leg}_calf_joint"], "child")]) for leg in FEET])
     # Left legs as they are, right ones in a mirror.
     mirrored = origins * np.stack([np.ones(4), SIDE, np.ones(4)], axis=1)[:, None]
     turned = np.where(SIDE[:, None] > 0.0, limits[:, 0], -limits[:, 0, ::-1])
@@ -140,7 +138,7 @@ def _measure(robot: Element) -> Geometry:
         thigh=float(-origins[0, 2, 2]),
         calf=float(-feet[0, 0]),
         foot_radius=float(feet[0, 1]),
-        trunk_mass=_mass(trunk),
+        trunk_mass=_mass(parts[_link_of(joints["FL_hip_joint"], "parent")][0].link),
         joint_limits=limits.reshape(len(JOINTS), 2),
     )
 
@@ -148,64 +146,85 @@ def _measure(robot: Element) -> Geometry:
 # ---------------------------------------------------------------------------- elements
 
 
-def _joints(robot: Element) -> dict[str, Element]:
-    """The joints by name: those of ``JOINTS`` and no others."""
+def _joints(robot: Element) -> tuple[dict[str, Element], list[Element]]:
+    """The joints of ``JOINTS`` by name, and the fixed ones; there are no others."""
     found = robot.findall("joint")
     names = Counter(joint.get("name", "") for joint in found)
     missing = [name for name in JOINTS if name not in names]
     if missing:
         raise ConfigError(f"lacks the joints {', '.join(missing)}")
-    others = list((names - Counter(JOINTS)).elements())
+    fixed = [j for j in found if j.get("type") == "fixed" and j.get("name") not in JOINTS]
+    moving = [joint for joint in found if joint not in fixed]
+    others = list(Counter(joint.get("name", "") for joint in moving) - Counter(JOINTS))
     if others:
-        shown = reprlib.repr(others[0])
         raise ConfigError(
-            f"has the joint {shown} beside the twelve of its legs, {JOINTS[0]} to {JOINTS[-1]}: "
-            "what is fixed must be part of the link that carries it"
+            f"has the joint {reprlib.repr(others[0])} beside the twelve of its legs, {JOINTS[0]} "
+            f"to {JOINTS[-1]}: others must be fixed"
         )
-    return {joint.get("name", ""): joint for joint in found}
+    return {joint.get("name", ""): joint for joint in moving}, fixed
 
 
-def _links(robot: Element, joints: dict[str, Element]) -> dict[str, Element]:
-    """The links by name: the trunk, and in each leg hip, thigh and calf one after the other."""
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A link, and where it is in the frame of the link that carries it.
+
+    Attributes:
+        link: its element.
+        place: of its origin, (3,) m.
+        rotation: from its frame, (3, 3).
+    """
+
+    link: Element
+    place: Array
+    rotation: Array
+
+    def carry(self, joint: Element, link: Element) -> _Part:
+        """The part that ``joint`` fixes to this one."""
+        place, turn = (_numbers(joint, "origin", key, "0 0 0") for key in ("xyz", "rpy"))
+        return _Part(link, self.place + self.rotation @ place, self.rotation @ _rotation(turn))
+
+
+def _parts(
+    robot: Element, joints: dict[str, Element], fixed: list[Element]
+) -> dict[str, list[_Part]]:
+    """By name the trunk and in each leg hip, thigh and calf: itself first, then what is fixed to
+    it. There are no other links."""
+    links = {link.get("name", ""): link for link in robot.findall("link")}
+    if len(links) < len(robot.findall("link")):
+        raise ConfigError("two of its links have one name")
     trunk = _link_of(joints["FL_hip_joint"], "parent")
-    chained = [trunk]
+    carriers = [trunk]
     for leg in FEET:
-        above = trunk
-        for part in _PARTS:
-            joint = joints[f"{leg}_{part}_joint"]
-            if _link_of(joint, "parent") != above:
+        parent = trunk
+        for name in _PARTS:
+            joint = joints[f"{leg}_{name}_joint"]
+            if _link_of(joint, "parent") != parent:
                 raise ConfigError(
-                    f"{_called(joint)}: its parent must be {reprlib.repr(above)}; a leg is a hip "
+                    f"{_called(joint)}: its parent must be {reprlib.repr(parent)}; a leg is a hip "
                     "on the trunk, a thigh on the hip and a calf on the thigh"
                 )
-            above = _link_of(joint, "child")
-            chained.append(above)
-    links = robot.findall("link")
-    if Counter(link.get("name", "") for link in links) != Counter(chained):
+            parent = _link_of(joint, "child")
+            carriers.append(parent)
+    placed: dict[str, list[_Part]] = {}
+    for carrier in carriers:
+        if carrier not in links:
+            raise ConfigError(f"a joint moves the link {reprlib.repr(carrier)}, which is not there")
+        mine = placed[carrier] = [_Part(links.pop(carrier), np.zeros(3), np.eye(3))]
+        for above in mine:  # which grows
+            for joint in fixed:
+                if _link_of(joint, "parent") == above.link.get("name"):
+                    child = links.pop(_link_of(joint, "child"), None)
+                    if child is None:
+                        raise ConfigError(f"{_called(joint)}: its child must be a link of its own")
+                    mine.append(above.carry(joint, child))
+    if links:
         raise ConfigError(
-            f"its links must be the trunk and one for each of the twelve joints, {len(chained)} "
-            f"with different names; it has {len(links)}"
+            f"link {reprlib.repr(next(iter(links)))}: belongs to no leg and is not fixed to the "
+            "trunk; the trunk, which has the hips, must be the root"
         )
-    for link in links:
-        _mass(link)
-    return {link.get("name", ""): link for link in links}
-
-
-def _check_trunk(trunk: Element) -> None:
-    """Bullet's pose of a robot is that of its trunk's inertia, so that frame must be the link's."""
-    inertia = [
-        *_numbers(trunk, "inertial/origin", "xyz", "0 0 0"),
-        *_numbers(trunk, "inertial/origin", "rpy", "0 0 0"),
-        *(
-            float(_numbers(trunk, "inertial/inertia", key, "0", 1)[0])
-            for key in ("ixy", "ixz", "iyz")
-        ),
-    ]
-    if not _same(inertia, 0.0):
-        raise ConfigError(
-            f"{_called(trunk)}: the trunk's frame must be at its centre of mass and along the axes "
-            "of its inertia: inertial origin, ixy, ixz and iyz of 0"
-        )
+    for part in (part for mine in placed.values() for part in mine):
+        _mass(part.link)
+    return placed
 
 
 def _origin(joint: Element) -> Array:
@@ -236,17 +255,20 @@ def _limits(joint: Element) -> Array:
     return np.array([low, high])
 
 
-def _foot(calf: Element) -> Array:
+def _foot(parts: list[_Part]) -> Array:
     """Height in the calf's frame and radius of the foot, (2,) m."""
-    shapes = [f"collision[{k + 1}]" for k in range(len(calf.findall("collision")))]
-    places = [_numbers(calf, f"{shape}/origin", "xyz", "0 0 0") for shape in shapes]
-    lowest = min(range(len(shapes)), key=lambda k: places[k][2], default=-1)
-    if lowest < 0 or calf.find(f"{shapes[lowest]}/geometry/sphere") is None:
+    calf = parts[0].link
+    shapes = [
+        (part.place + part.rotation @ _numbers(shape, "origin", "xyz", "0 0 0"), shape)
+        for part in parts
+        for shape in part.link.findall("collision")
+    ]
+    (x, y, z), foot = min(shapes, key=lambda shape: shape[0][2], default=(np.zeros(3), calf))
+    if foot.find("geometry/sphere") is None:
         raise ConfigError(
             f"{_called(calf)}: its lowest collision shape must be its foot, which is a sphere"
         )
-    x, y, z = places[lowest]
-    radius = float(_numbers(calf, f"{shapes[lowest]}/geometry/sphere", "radius", "", 1)[0])
+    radius = float(_numbers(foot, "geometry/sphere", "radius", "", 1)[0])
     if not (_same([x, y], 0.0) and z < -_SAME and radius > 0.0):
         raise ConfigError(f"{_called(calf)}: the foot must be at 0 0 z, z < 0, and its radius > 0")
     return np.array([z, radius])
@@ -280,6 +302,18 @@ def _numbers(element: Element, path: str, key: str, default: str, count: int = 3
             f"{_called(element)}: {path} {key} must be {wanted}, not {reprlib.repr(text)}"
         )
     return values
+
+
+def _rotation(rpy: Array) -> Array:
+    """Of a URDF's roll, pitch and yaw, (3,) rad, about fixed axes in that order: (3, 3)."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
 
 
 def _called(element: Element) -> str:

@@ -136,6 +136,20 @@ def rotation_matrix(quaternion: Array) -> Array:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
+def quaternion_product(one: Array, other: Array) -> Array:
+    """Turn by ``other`` and then by ``one``: quaternions (..., 4) twice -> (..., 4)."""
+    (ax, ay, az, aw), (bx, by, bz, bw) = np.moveaxis(one, -1, 0), np.moveaxis(other, -1, 0)
+    return np.stack(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ],
+        axis=-1,
+    )
+
+
 def yaw_quaternion(yaw: Array) -> Array:
     """Quaternions (M, 4) of upright bodies with heading ``yaw`` (M,) rad."""
     zero = np.zeros_like(yaw)

@@ -22,7 +22,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
 from tdgc.geometry import JOINTS, read_geometry, urdf_path
-from tdgc.robot import NUM_JOINTS, Array, RobotState, pd_torque
+from tdgc.robot import (
+    NUM_JOINTS,
+    Array,
+    RobotState,
+    pd_torque,
+    quaternion_product,
+    rotation_matrix,
+)
 from tdgc.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
 
 _GROUND, _ROBOT = 1, 2  # collision groups: robots meet the ground and nothing else
@@ -114,7 +121,10 @@ class World:
                 self._client_of.append(client)
                 client.rows[self._bodies[-1]] = int(rows[k])
             self._clients.append(client)
-        self._trunk_inertia = np.array(self._client_of[0].getDynamicsInfo(self._bodies[0], -1)[2])
+        trunk = self._client_of[0].getDynamicsInfo(self._bodies[0], -1)
+        # Bullet's pose of a robot is that of its trunk's inertia: where its centre of mass is in
+        # the trunk's frame, and how the axes of its inertia are turned there.
+        self._trunk_inertia, self._centre, self._axes = map(np.array, trunk[2:5])
         self._active = np.arange(num_robots)
 
     def _make_ground(self, client: _Client, count: int) -> None:
@@ -196,16 +206,25 @@ class World:
             )
         except pybullet.error as error:  # a mesh that is not there, an element it cannot read
             raise ConfigError(f"{path}: Bullet cannot load it and says why above") from error
-        found = {
-            client.getJointInfo(body, j)[1].decode(): j for j in range(client.getNumJoints(body))
-        }
+        joints = [client.getJointInfo(body, j) for j in range(client.getNumJoints(body))]
+        found = {joint[1].decode(): joint[0] for joint in joints}
         self._joints = [found[name] for name in JOINTS]
-        self._leg_of_link = {j: i // 3 for i, j in enumerate(self._joints)}
-        self._calf_links = {self._joints[3 * leg + 2] for leg in range(4)}
+        # What is fixed to a link belongs to it. Bullet's own URDF_MERGE_FIXED_LINKS is of no use:
+        # it takes the carrying link's centre of mass for its origin.
+        carrier = {-1: -1}
+        for joint in joints:  # parents come first
+            fixed = joint[2] == pybullet.JOINT_FIXED
+            carrier[joint[0]] = carrier[joint[16]] if fixed else joint[0]
+        self._trunk_links = [link for link, moved in carrier.items() if moved < 0]
+        self._leg_of_link = {
+            link: self._joints.index(moved) // 3 for link, moved in carrier.items() if moved >= 0
+        }
+        calves = self._joints[2::3]
+        self._calf_links = {link for link, moved in carrier.items() if moved in calves}
         # Bullet holds one speed limit a body, so it gets the slowest joint's: a calf that whips at
         # the other joints' 30 rad/s moves its foot further a step than the foot's radius.
         slowest = min(self.robot.speed_limit)
-        for link in range(-1, client.getNumJoints(body)):
+        for link in carrier:
             client.setCollisionFilterGroupMask(body, link, _ROBOT, _GROUND)
             client.changeDynamics(
                 body,
@@ -244,10 +263,43 @@ class World:
     def _put(self, i: int) -> None:
         """Bring robot ``i`` of Bullet to where ``state`` has it."""
         body, client, state = self._bodies[i], self._client_of[i], self.state
-        client.resetBasePositionAndOrientation(body, state.position[i], state.quaternion[i])
-        client.resetBaseVelocity(body, state.lin_vel[i], state.ang_vel[i])
+        self._place_trunk(i, state.position[i])
+        self._move_trunk(i)
         for joint, angle, speed in zip(self._joints, state.q[i], state.qd[i], strict=True):
             client.resetJointState(body, joint, angle, speed)
+
+    def _place_trunk(self, i: int, position: Array) -> None:
+        """Bring the trunk of robot ``i`` to ``position`` (3,), turned as ``state`` has it."""
+        quaternion = self.state.quaternion[i]
+        self._client_of[i].resetBasePositionAndOrientation(
+            self._bodies[i],
+            position + rotation_matrix(quaternion[None])[0] @ self._centre,
+            quaternion_product(quaternion, self._axes),
+        )
+
+    def _move_trunk(self, i: int) -> None:
+        """Let the trunk of robot ``i`` move as ``state`` has it."""
+        lin_vel, ang_vel = self.state.lin_vel[i], self.state.ang_vel[i]
+        arm = rotation_matrix(self.state.quaternion[i : i + 1])[0] @ self._centre
+        self._client_of[i].resetBaseVelocity(
+            self._bodies[i], lin_vel + np.cross(ang_vel, arm), ang_vel
+        )
+
+    def _read_trunks(self, live: NDArray[np.integer]) -> None:
+        """Fill ``state`` with where the trunks of the robots ``live`` are and how they move."""
+        robots = [(self._bodies[i], self._client_of[i].id) for i in live]
+        poses = [pybullet.getBasePositionAndOrientation(*robot) for robot in robots]
+        speeds = [pybullet.getBaseVelocity(*robot) for robot in robots]
+        axes = np.reshape([quaternion for _, quaternion in poses], (-1, 4))
+        quaternion = quaternion_product(axes, self._axes * [-1.0, -1.0, -1.0, 1.0])
+        arm = rotation_matrix(quaternion) @ self._centre
+        ang_vel = np.reshape([angular for _, angular in speeds], (-1, 3))
+        lin_vel = np.reshape([linear for linear, _ in speeds], (-1, 3))
+        state = self.state
+        state.position[live] = np.reshape([position for position, _ in poses], (-1, 3)) - arm
+        state.quaternion[live] = quaternion
+        state.lin_vel[live] = lin_vel - np.cross(ang_vel, arm)
+        state.ang_vel[live] = ang_vel
 
     def forget(self) -> None:
         """Let Bullet forget the contacts of the steps before; ``state`` stays as it is.
@@ -257,9 +309,7 @@ class World:
         for bit. For that every robot spends one physics step high above the ground.
         """
         for i in self._active:
-            body, client = self._bodies[i], self._client_of[i]
-            high = self.state.position[i] + [0.0, 0.0, _PARKED]
-            client.resetBasePositionAndOrientation(body, high, self.state.quaternion[i])
+            self._place_trunk(int(i), self.state.position[i] + [0.0, 0.0, _PARKED])
         for client in dict.fromkeys(self._client_of[i] for i in self._active):
             client.stepSimulation()
         for i in self._active:
@@ -271,7 +321,7 @@ class World:
         for k, i in enumerate(np.asarray(index)):
             body, client = self._bodies[i], self._client_of[i]
             mass = nominal + float(payload[k])
-            for link in range(-1, NUM_JOINTS):
+            for link in (*self._trunk_links, *self._leg_of_link):
                 client.changeDynamics(body, link, lateralFriction=float(friction[k]))
             # Spread over the trunk, the payload scales its inertia.
             client.changeDynamics(
@@ -287,9 +337,7 @@ class World:
         state = self.state
         for k, i in enumerate(np.asarray(index)):
             state.lin_vel[i] += velocity[k]
-            self._client_of[i].resetBaseVelocity(
-                self._bodies[i], state.lin_vel[i], state.ang_vel[i]
-            )
+            self._move_trunk(int(i))
         state.derive()
 
     def retire(self, index: ArrayLike) -> None:
@@ -339,17 +387,13 @@ class World:
             )
             force = np.zeros(self.num_robots)
             for client in clients:
-                for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=-1):
-                    force[client.rows[contact[2]]] += contact[9]
+                for link in self._trunk_links:
+                    for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=link):
+                        force[client.rows[contact[2]]] += contact[9]
             np.maximum(trunk_force, force, out=trunk_force)
         state.q[live], state.qd[live], state.torque[live] = q, qd, torque
         state.trunk_force = trunk_force
-        poses = [pybullet.getBasePositionAndOrientation(body, i) for i, body in robots]
-        speeds = [pybullet.getBaseVelocity(body, i) for i, body in robots]
-        state.position[live] = np.reshape([position for position, _ in poses], (-1, 3))
-        state.quaternion[live] = np.reshape([quaternion for _, quaternion in poses], (-1, 4))
-        state.lin_vel[live] = np.reshape([linear for linear, _ in speeds], (-1, 3))
-        state.ang_vel[live] = np.reshape([angular for _, angular in speeds], (-1, 3))
+        self._read_trunks(live)
         state.derive()
         self._read_contacts()
 
@@ -367,9 +411,10 @@ class World:
         for client in self._clients:
             for contact in client.getContactPoints(bodyA=client.ground):
                 force, link = contact[9], contact[4]
-                if force <= 0.0 or link < 0:
+                leg = self._leg_of_link.get(link)
+                if force <= 0.0 or leg is None:  # None is the trunk
                     continue
-                row, leg = client.rows[contact[2]], self._leg_of_link[link]
+                row = client.rows[contact[2]]
                 if link in self._calf_links:
                     (x, y, z), (fx, fy, fz) = contact[6], feet[row][leg]
                     if (x - fx) ** 2 + (y - fy) ** 2 + (z - fz) ** 2 < reach:

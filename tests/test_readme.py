@@ -61,10 +61,10 @@ COMMANDS: dict[str, str | None] = {
     "python -m tdgc.bench --out runs/bench": (
         "--robots 2 --workers 1 --seconds 0.1 --out {tmp}/bench"
     ),
-    "python train_low.py --set env.robot.urdf=my_robot.urdf --set env.robot.base_height=0.34 "
-    "--out runs/my_low": f"{TRAIN} --set env.robot.urdf={{tmp}}/my_robot.urdf --out {{tmp}}/my_low",
-    "python train_high.py --low runs/my_low/policy --out runs/my_high": (
-        f"{TRAIN_HIGH} --low {{tmp}}/my_low/policy --out {{tmp}}/my_high"
+    "python train_low.py --set env.robot.urdf=a1/a1.urdf --set env.robot.base_height=0.27 "
+    "--out runs/a1_low": f"{TRAIN} --set env.robot.urdf={{tmp}}/a1/a1.urdf --out {{tmp}}/a1_low",
+    "python train_high.py --low runs/a1_low/policy --out runs/a1_high": (
+        f"{TRAIN_HIGH} --low {{tmp}}/a1_low/policy --out {{tmp}}/a1_high"
     ),
     "python evaluate.py --families hills.npy": (
         "--families {tmp}/hills.npy --levels 5 --policies gp --episodes 1 --workers 1 --video "
@@ -99,8 +99,8 @@ OUTPUTS = (
     "video/films/strip_gap_10.png",
     "export/low.pt",
     "export/high_interface.json",
-    "my_low/policy.safetensors",
-    "my_high/policy.safetensors",
+    "a1_low/policy.safetensors",
+    "a1_high/policy.safetensors",
     "bench/bench.json",
     "own/trajectories.png",
     "own/films/sheet_gp_nominal_{map}_05_000.png",
@@ -138,12 +138,9 @@ def test_every_command_is_in_the_table() -> None:
 
 def test_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    shipped = (ROOT / "urdf" / "quadruped.urdf").read_text(encoding="utf-8")
-    longer = shipped.replace(" -0.213", " -0.25")  # thighs and calves, m
-    (tmp_path / "my_robot.urdf").write_text(longer, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     for code in blocks("python"):
-        exec(compile(code, "README.md", "exec"), {})  # one of them writes the heights
+        exec(compile(code, "README.md", "exec"), {})  # they write a robot and a terrain
     for command, added in COMMANDS.items():
         if added is BY_CI:
             continue

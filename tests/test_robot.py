@@ -24,6 +24,7 @@ from tdgc.robot import (
     leg_angles,
     nominal_pose,
     pd_torque,
+    quaternion_product,
     rotation_matrix,
     wrap_angle,
     yaw_quaternion,
@@ -173,6 +174,12 @@ def test_yaw_quaternion_and_wrap_angle() -> None:
 
 
 # ------------------------------------------------------------------ joints
+
+
+def test_quaternion_product_turns_by_the_second_first() -> None:
+    one, other = quaternion(0.3, -0.5, 1.0), quaternion(-1.2, 0.4, 0.2)
+    both = rotation_matrix(quaternion_product(one, other))
+    np.testing.assert_allclose(both, rotation_matrix(one) @ rotation_matrix(other), atol=1e-12)
 
 
 def test_joint_order() -> None:
