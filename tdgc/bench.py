@@ -35,9 +35,10 @@ from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.logger import Logger
 
-from tdgc.cluster import CLUSTER_HELP, ActorLink, ClusterError, connect
+from tdgc.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
 from tdgc.cores import auto_workers, usable_cores, workers_flag
+from tdgc.errors import InputError
 from tdgc.high_env import NavigationTask
 from tdgc.low_env import LowLevelTask
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
@@ -314,6 +315,23 @@ def compare_places(robots: int, workers: int, seconds: float) -> dict[str, Any]:
     return result
 
 
+def choose_workers(args: argparse.Namespace) -> int:
+    """As many as ``--workers`` says, on this machine or in the cluster, which is joined.
+
+    Raises:
+        InputError: a number that is not allowed, or a cluster that cannot be used.
+    """
+    cores = usable_cores() if args.cluster is None else connect(args.cluster)
+    workers: int = args.workers
+    if args.workers == "auto":
+        workers = auto_workers(args.robots, min(cores, usable_cores()))
+    if not 1 <= workers <= args.robots:
+        raise InputError("--workers must be 1 to the number of robots")
+    if args.cluster is not None:
+        check_workers(workers, cores)
+    return workers
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--robots", type=int, default=100)
@@ -328,18 +346,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     args = parser.parse_args(arguments)
     try:
-        cores = usable_cores() if args.cluster is None else connect(args.cluster)
-    except ClusterError as error:
+        args.workers = choose_workers(args)
+    except InputError as error:
         print(f"tdgc.bench: {error}", file=sys.stderr)
-        return 2
-    if args.workers == "auto":
-        args.workers = auto_workers(args.robots, min(cores, usable_cores()))
-    if not 1 <= args.workers <= args.robots:
-        print("tdgc.bench: --workers must be 1 to the number of robots", file=sys.stderr)
-        return 2
-    if args.cluster is not None and args.workers > cores:
-        few = f"the cluster's {cores} CPUs are too few for {args.workers} workers"
-        print(f"tdgc.bench: {few}", file=sys.stderr)
         return 2
     if args.load:
         name, result = "load.json", compare_loads(args.seconds)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from tdgc import __version__
 from tdgc.errors import InputError, install_hint
 from tdgc.state import State, copies
-from tdgc.worker import BLAS_THREADS, Arrays, MakeTask, Worker, WorkerError, keep_memory
+from tdgc.worker import BLAS_THREADS, Beginning, MakeTask, Worker, WorkerError, keep_memory
 
 _REACH_SECONDS = 5.0  # to be let in by the cluster
 _JOIN_SECONDS = 120.0  # for every node to start a Python and import this package
@@ -73,6 +73,16 @@ def connect(address: str) -> int:
             ray.shutdown()
             raise
     return int(ray.cluster_resources().get("CPU", 0))
+
+
+def check_workers(workers: int, cpus: int) -> None:
+    """See that each of ``workers`` finds one of the cluster's ``cpus``: others would wait for ever.
+
+    Raises:
+        ClusterError: there are too few.
+    """
+    if workers > cpus:
+        raise ClusterError(f"the cluster's {cpus} CPUs are too few for {workers} workers")
 
 
 def _join(address: str) -> None:
@@ -155,7 +165,7 @@ class _Actor:
         state: State | None,
     ) -> tuple[Any, ...]:
         self._views = copies(views)
-        self._worker = Worker(make_task, len(views["rewards"]), seed, self._views, state)
+        self._worker = Worker(make_task, self._views, seed, state)
         return self._reply(self._worker.task.state_dict(), "obs")
 
     def answer(self, word: str, argument: Any) -> tuple[Any, ...]:
@@ -186,35 +196,29 @@ class ActorLink:
     is lost is told of, so that whoever has the link starts another one.
 
     Args:
-        worker, make_task, arrays, rows, seed, state: see ``tdgc.worker.ProcessLink``.
+        worker: its number.
+        beginning: what it begins with.
     """
 
-    def __init__(
-        self,
-        worker: int,
-        make_task: MakeTask,
-        arrays: Arrays,
-        rows: slice,
-        seed: int,
-        state: State | None,
-    ) -> None:
-        self._worker = worker
-        self._views = {name: view[rows] for name, view in arrays.views().items()}
+    def __init__(self, worker: int, beginning: Beginning) -> None:
+        self._worker, self._beginning = worker, beginning
+        self._views = beginning.views()
         self._pid, self._place = 0, "no node yet"
-        self._beginning = make_task, seed, state
         self._restarts = 0
         self._begin()
 
     def _begin(self) -> None:
         import ray
 
-        make_task, seed, state = self._beginning
+        begin = self._beginning
         self._actor = (
             ray.remote(_Actor)
             .options(num_cpus=1, max_restarts=0, scheduling_strategy="SPREAD")
             .remote()
         )
-        self._reply = self._actor.start.remote(make_task, self._views, seed, state)
+        self._reply = self._actor.start.remote(
+            begin.make_task, self._views, begin.seed, begin.state
+        )
 
     @property
     def pid(self) -> int:

@@ -39,7 +39,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tqdm import tqdm
 
 from tdgc import __version__, policies
-from tdgc.cluster import CLUSTER_HELP, ActorLink, ClusterError, connect
+from tdgc.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.config import Config, ConfigError, from_dict, read_json, to_dict, with_overrides
 from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.errors import InputError
@@ -539,8 +539,8 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
         workers = auto_workers(to_dict(config)["n_envs"], cores)
         config = with_overrides(config, [f"workers={workers}"])
     workers = to_dict(config)["workers"]
-    if args.cluster is not None and workers > cores:
-        raise ClusterError(f"the cluster's {cores} CPUs are too few for {workers} workers")
+    if args.cluster is not None:
+        check_workers(workers, cores)
     return config
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from tdgc.state import State, copies
-from tdgc.worker import Arrays, Link, MakeLink, MakeTask, ProcessLink, WorkerError
+from tdgc.worker import Arrays, Beginning, Link, MakeLink, MakeTask, ProcessLink, WorkerError
 
 #: Faults of workers within so many steps that stop a run. A fault of the code comes back at once
 #: or in every episode, and the low level's last 1000 steps; one of the machine does not. Workers
@@ -132,7 +132,8 @@ class TaskVecEnv(VecEnv):
 
     def _start(self, worker: int, state: State | None = None) -> Link:
         seed = worker_seed(self._seed, worker, self._restarts[worker])
-        return self._link(worker, self._make_task, self._arrays, self._rows[worker], seed, state)
+        rows = self._rows[worker]
+        return self._link(worker, Beginning(self._make_task, self._arrays, rows, seed, state))
 
     def _replace(self, worker: int, restarts: int, state: State | None = None) -> None:
         """Put a new worker in another one's place; it has to be waited for."""

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -103,10 +103,6 @@ class Link(Protocol):
         """End it, by force if it has not ended by itself within ``timeout`` s."""
 
 
-#: (number, task, arrays of all robots, its rows of them, seed, state, see ``Worker``) -> a worker.
-MakeLink = Callable[[int, MakeTask, "Arrays", slice, int, State | None], Link]
-
-
 # ---------------------------------------------------------------------------- the worker
 
 
@@ -134,6 +130,30 @@ class Arrays:
             flat: NDArray[Any] = np.frombuffer(raw, dtype=dtype)
             views[name] = flat.reshape(num, width[name]) if name in width else flat
         return views
+
+
+class Beginning(NamedTuple):
+    """What a worker begins with.
+
+    Attributes:
+        make_task: picklable, called where the worker runs as ``make_task(robots, seed)``.
+        arrays: of all robots; ``rows`` of them are the worker's.
+        seed: of its task.
+        state: of a worker that failed; all but the randomness is taken over from it.
+    """
+
+    make_task: MakeTask
+    arrays: Arrays
+    rows: slice
+    seed: int
+    state: State | None = None
+
+    def views(self) -> dict[str, NDArray[Any]]:
+        """The worker's rows of the arrays."""
+        return {name: view[self.rows] for name, view in self.arrays.views().items()}
+
+
+MakeLink = Callable[[int, Beginning], Link]  # its number, and how it begins -> a worker
 
 
 def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
@@ -179,24 +199,12 @@ def _load(task: Task, views: dict[str, NDArray[Any]], state: State) -> None:
 
 
 class Worker:
-    """Some robots of a task, whose arrays are ``views``.
-
-    Args:
-        make_task: makes the task.
-        robots, seed: what it is made with.
-        views: the robots' arrays, see ``Arrays``.
-        state: of a worker that failed; all but the randomness is taken over from it.
-    """
+    """Some robots of a task, whose arrays are ``views``; the rest is as in ``Beginning``."""
 
     def __init__(
-        self,
-        make_task: MakeTask,
-        robots: int,
-        seed: int,
-        views: dict[str, NDArray[Any]],
-        state: State | None = None,
+        self, make_task: MakeTask, views: dict[str, NDArray[Any]], seed: int, state: State | None
     ) -> None:
-        self.task, self._views = make_task(robots, seed), views
+        self.task, self._views = make_task(len(views["rewards"]), seed), views
         if state is not None:
             _load(self.task, views, {**state, "rng": self.task.state_dict()["rng"]})
         self._blow_ups = 0
@@ -245,14 +253,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _serve(
-    pipe: Connection,
-    make_task: MakeTask,
-    arrays: Arrays,
-    rows: slice,
-    seed: int,
-    state: State | None,
-) -> None:
+def _serve(pipe: Connection, beginning: Beginning) -> None:
     """A worker's life: tell its state, then answer one word at a time until told to close."""
     # What a terminal or a batch system sends to all processes is the parent's to answer.
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -260,8 +261,8 @@ def _serve(
     threading.Thread(target=_end_with_parent, daemon=True).start()
     worker: Worker | None = None
     try:
-        views = {name: view[rows] for name, view in arrays.views().items()}
-        worker = Worker(make_task, rows.stop - rows.start, seed, views, state)
+        views = beginning.views()
+        worker = Worker(beginning.make_task, views, beginning.seed, beginning.state)
         pipe.send(worker.task.state_dict())
         while True:
             word, argument = pipe.recv()
@@ -334,31 +335,20 @@ class ProcessLink:
 
     Args:
         worker: its number.
-        make_task: picklable, called there as ``make_task(robots, seed)``.
-        arrays: of all robots; ``rows`` of them are the worker's.
-        seed: of its task.
-        state: see ``Worker``.
+        beginning: what it begins with.
     """
 
-    def __init__(
-        self,
-        worker: int,
-        make_task: MakeTask,
-        arrays: Arrays,
-        rows: slice,
-        seed: int,
-        state: State | None,
-    ) -> None:
+    def __init__(self, worker: int, beginning: Beginning) -> None:
         context = mp.get_context("spawn")
         self._worker = worker
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
             target=_serve,
-            args=(theirs, make_task, arrays, rows, seed, state),
+            args=(theirs, beginning),
             daemon=True,
             name=f"tdgc-worker-{worker}",
         )
-        with one_blas_thread(), _without_script(make_task):
+        with one_blas_thread(), _without_script(beginning.make_task):
             self._process.start()
         theirs.close()
 
