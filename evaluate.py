@@ -183,7 +183,7 @@ def make_drivers(
         if name == "gp":
             drivers[name] = BaselineDriver()
         elif name == TEACHER:
-            drivers[name] = TeacherDriver()
+            drivers[name] = TeacherDriver(low, config)
         elif high is None:
             raise ValueError("no high level is shipped; give one with --high, or use --policies gp")
         else:

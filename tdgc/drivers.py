@@ -20,6 +20,7 @@ from tdgc.config import (
     from_dict,
 )
 from tdgc.high_env import SEMANTIC, check_pair, high_layout, observe_high
+from tdgc.leaps import measure_landing
 from tdgc.locomotion import Locomotion
 from tdgc.policies import Policy
 from tdgc.robot import Array, wrap_angle
@@ -94,17 +95,22 @@ class TeacherDriver:
 
     It is told what the hierarchy has to find out, so it is no rival: it shows what the low level
     can do when it is told the right thing.
+
+    Args:
+        low, config: the low level, whose leaps are measured first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, low: Policy, config: LowLevelConfig) -> None:
         self.config = HighLevelConfig(cues="none")
+        self._landing = measure_landing(low, config, self.config.decimation)
         self.bounds = CommandRanges()
         self.action: NDArray[np.floating] | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
         self._loco, self._goal = loco, goal
         assert loco.world.field is not None  # episodes run on tiles
-        self._teacher = Teacher(loco.world.field, [family] * loco.num_robots)
+        families = [family] * loco.num_robots
+        self._teacher = Teacher(loco.world.field, families, self._landing)
         self._teacher.begin(np.arange(loco.num_robots), goal)
 
     def command(self, step: int) -> Array:

@@ -25,6 +25,7 @@ from tdgc.config import (
 )
 from tdgc.curriculum import Curriculum
 from tdgc.gaits import GAITS
+from tdgc.leaps import LANDING, Landing
 from tdgc.locomotion import SPEED_SCALE, Locomotion
 from tdgc.low_env import GOAL_RADIUS, TaskEnv, is_fallen
 from tdgc.policies import Policy
@@ -207,6 +208,7 @@ class NavigationTask:
         guided: decisions of each robot in which a teacher helps, see ``tdgc.imitation``. Its
             actions follow the observation, and it drives a share of the episodes that falls from
             all to none over the first ``_GUIDANCE`` of these decisions.
+        landing: of the low level, for the teacher.
     """
 
     def __init__(
@@ -218,6 +220,7 @@ class NavigationTask:
         training: bool = True,
         visual: bool = False,
         guided: int = 0,
+        landing: Landing = LANDING,
     ) -> None:
         self.config, self._visual = config, visual
         self.num_robots = m = num_robots
@@ -244,7 +247,7 @@ class NavigationTask:
         self._commands = np.zeros((3, m, 15))
         self.stats: dict[str, float] = {}
         families = [config.families[f] for f in self.family]
-        self.teacher = Teacher(self.field, families) if guided else None
+        self.teacher = Teacher(self.field, families, landing) if guided else None
         self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))

@@ -17,6 +17,7 @@ from tdgc import rewards
 from tdgc.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.config import LowLevelConfig
 from tdgc.gaits import GAITS, gait_embedding, swing_profile
+from tdgc.leaps import LANDING, straddling_frequency
 from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
 from tdgc.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.state import State, copies, fill
@@ -86,15 +87,7 @@ _TRENCH_GAITS = (0.15, 0.85, 0.0, 0.0)
 _LEAP_SPEED = (0.9, 1.0)  # m/s
 _LEAP_SWING = 0.07  # m at most: four legs drawn up at once drop the trunk
 _STRIDE = (0.35, 0.39)  # m; the robot is slow to start with longer ones
-#: m/s, what leaps are timed for while the robot is slower. At the 2 Hz of a start from rest they
-#: threw every robot down.
-LEAP_START = 1.0
-# Where pronk lands, measured in low-9 at about 1 m/s and 2.5 Hz: front feet so far ahead of the
-# trunk as it is at clock 0, and rear feet so much further behind them than commanded, since they
-# touch down sooner.
-_LANDING = (0.20, 0.055)  # m
 _CENTRES = np.array([trench_centres(level / MAX_LEVEL) for level in range(MAX_LEVEL + 1)])
-_TIMING_GAIN = 1.5  # share of the frequency for each cycle that the feet are out of time
 # Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet land
 # on the same lines, so that a trench fits between two of them. Drawn evenly, such commands are too
 # rare: of 0.86 m/s at 2 Hz the robot did 0.5. As shares of the ranges: 0.7-1 m/s at 2-2.75 Hz.
@@ -108,29 +101,6 @@ _GROW_LIN, _GROW_YAW = 0.5, 0.5
 # Share of feet in contact as desired: speed comes after gait. At 0.8 bound never left its first
 # ranges, since its rear feet lift late, and then undershot every faster command.
 _GROW_CONTACT = 0.7
-
-
-def straddling_frequency(
-    x: Array, speed: Array, clock: Array, stride: Array, length: Array, centres: Array
-) -> Array:
-    """Step frequency in Hz at which pronk lands at either side of the trenches, (M,).
-
-    Args:
-        x: (M,) m, trunk along the tile.
-        speed: (M,) m/s, forward.
-        clock: (M,) the gait's, 0 where the feet touch down.
-        stride, length: (M,) m, from one landing to the next, and between front and rear feet.
-        centres: (M, n) m along the tile, of the trenches.
-
-    Feed-forward keeps the stride; to it comes what brings the lines on which front and rear feet
-    land half a stride before the centre of the nearest trench.
-    """
-    front, rear = _LANDING[0], _LANDING[0] - length - _LANDING[1] + stride  # the rear's next line
-    landing = x + 0.5 * (front + rear)
-    nearest = np.abs(landing[:, None] - centres).argmin(axis=1)
-    trench = centres[np.arange(len(x)), nearest]
-    late = np.mod((landing - trench) / stride - clock, 1.0) - 0.5  # 0.5 turns -0.5 strides to 0
-    return np.asarray(speed / stride * (1.0 + _TIMING_GAIN * late))
 
 
 def is_fallen(world: World) -> NDArray[np.bool_]:
@@ -401,7 +371,7 @@ class LowLevelTask:
         swing = INDEX["swing_height"]
         values[leaps, swing] = rng.uniform(self._low[swing], _LEAP_SWING, int(leaps.sum()))
         stride, length = rng.uniform(*_STRIDE, n), INDEX["stance_length"]
-        closest = np.clip(stride - _LANDING[1], self._low[length], self._high[length])
+        closest = np.clip(stride - LANDING.spread, self._low[length], self._high[length])
         values[leaps, length] = closest[leaps]
         command[index] = np.concatenate([values, gait_embedding(gait)], axis=1)
         self._stride[index] = np.where(leaps, stride, 0.0)
@@ -456,7 +426,7 @@ class LowLevelTask:
             command = self.locomotion.command[leaping]
             frequency = straddling_frequency(
                 (state.position[:, 0] - self._origin[:, 0])[leaping],
-                np.maximum(state.heading_vel[leaping, 0], LEAP_START),
+                state.heading_vel[leaping, 0],
                 self.locomotion.clock.clock[leaping],
                 self._stride[leaping],
                 command[:, INDEX["stance_length"]],

@@ -18,8 +18,16 @@ from numpy.typing import NDArray
 from tdgc.commands import INDEX, default_command
 from tdgc.config import CommandRanges
 from tdgc.gaits import GAITS, gait_embedding
+from tdgc.leaps import (
+    LANDING,
+    SPEED,
+    STANCE_LENGTH,
+    STRIDE,
+    SWING_HEIGHT,
+    Landing,
+    straddling_frequency,
+)
 from tdgc.locomotion import Locomotion
-from tdgc.low_env import LEAP_START, straddling_frequency
 from tdgc.robot import Array, wrap_angle
 from tdgc.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TRENCH_DEPTH, TileField
 
@@ -41,10 +49,9 @@ STYLES = {
     "rough": Style(0.6, swing_height=0.2, stance_width=0.32),
     "pillar": Style(0.5),
     "stair": Style(0.6, swing_height=0.2, stance_width=0.35),
-    "gap": Style(1.0, swing_height=0.05, stance_length=0.33, gait="pronk"),
+    "gap": Style(SPEED, swing_height=SWING_HEIGHT, stance_length=STANCE_LENGTH, gait="pronk"),
     "tilt": Style(0.6, frequency=3.5, swing_height=0.2),
 }
-_STRIDE = 0.37  # m, between leaps: at 0.35 no robot crossed the 30 cm of level 10, at 0.37 most do
 _BEYOND = 0.5  # m behind the last trench, where leaping ends
 
 # The way around pillars follows a field of travel costs on every second sample of the tile.
@@ -141,15 +148,18 @@ class Teacher:
     Args:
         field: (M, 1) tiles.
         families: of the robots, (M,) names.
+        landing: of the low level that they have.
 
     Raises:
         ValueError: a family it has no style for.
     """
 
-    def __init__(self, field: TileField, families: Sequence[str]) -> None:
+    def __init__(
+        self, field: TileField, families: Sequence[str], landing: Landing = LANDING
+    ) -> None:
         check_styles(families)
         m = len(families)
-        self._field = field
+        self._field, self._landing = field, landing
         self._origin = field.origin(np.arange(m), 0)
         self._leaps = np.array([family == "gap" for family in families])
         self._pillars = np.array([family == "pillar" for family in families])
@@ -197,11 +207,12 @@ class Teacher:
         if rows.size:
             frequency = straddling_frequency(
                 local[rows, 0],
-                np.maximum(state.heading_vel[rows, 0], LEAP_START),
+                state.heading_vel[rows, 0],
                 loco.clock.clock[rows],
-                np.full(rows.size, _STRIDE),
+                np.full(rows.size, STRIDE),
                 command[rows, INDEX["stance_length"]],
                 self._centres[rows],
+                self._landing,
             )
             command[rows, INDEX["frequency"]] = np.clip(frequency, *CommandRanges().frequency)
         return command

@@ -25,6 +25,7 @@ from tdgc.config import (
 )
 from tdgc.drivers import BaselineDriver, GoToGoal, HierarchyDriver, TeacherDriver, load_high
 from tdgc.high_env import PRETRAINED, SEMANTIC, NavigationTask, high_layout, load_low, observe_high
+from tdgc.leaps import measure_landing
 from tdgc.locomotion import Locomotion
 from tdgc.policies import Policy
 from tdgc.recurrent import FastRecurrentPolicy
@@ -108,15 +109,16 @@ def test_baseline_holds_the_default_behaviour_parameters(low):
 def test_the_teacher_drives_as_it_teaches(low):
     """Its commands are those that the apprentice is shown, held for a decision."""
     policy, _ = low
+    landing = measure_landing(*low, decimation=5)
     task = NavigationTask(
-        HighLevelConfig(families=("gap", "stair")), LOW, 2, seed=4, training=False, guided=1
+        HighLevelConfig(families=("gap", "stair")), LOW, 2, 4, False, guided=1, landing=landing
     )
     try:
         task.reset(np.arange(2))
         loco = task.locomotion
         drivers = {}
         for family in ("gap", "stair"):
-            driver = TeacherDriver()
+            driver = TeacherDriver(*low)
             driver.begin(loco, task.goal, family)
             drivers[family] = driver
         for step in range(12):

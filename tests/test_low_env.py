@@ -23,7 +23,6 @@ from tdgc.low_env import (
     LowLevelTask,
     is_fallen,
     shallow,
-    straddling_frequency,
     summarise,
 )
 from tdgc.robot import Array, RobotState, nominal_pose, yaw_quaternion
@@ -630,28 +629,6 @@ def test_penalties_count_half_on_relief() -> None:
     positive = 0.02 * sum(v for v in terms.values() if v > 0.0)
     share = math.log(rewarded["tilt"] / positive) / math.log(rewarded["flat"] / positive)
     assert share == pytest.approx(0.5, rel=1e-6)
-
-
-def test_timing_puts_landings_at_either_side_of_a_trench() -> None:
-    """Trenches at 2.1 m and 3.35 m; feet land 0.20 m ahead, all on one line."""
-
-    def frequency(x: float, clock: float, length: float = 0.345) -> float:
-        one = np.ones(1)
-        timed = straddling_frequency(
-            x * one, one, clock * one, 0.4 * one, length * one, np.array([[2.1, 3.35]])
-        )
-        return float(timed[0])
-
-    on_time = 2.1 - 0.2 - 0.2  # the trunk when the feet land half a stride before the centre
-    assert frequency(on_time, 0.0) == pytest.approx(2.5)
-    assert frequency(on_time + 0.1, 0.25) == pytest.approx(2.5)  # a quarter of a cycle later
-    assert frequency(on_time + 0.4, 0.0) == pytest.approx(2.5)  # the landing behind it
-    assert frequency(on_time + 1.25, 0.0) == pytest.approx(2.5)  # before the next one
-    # Too far for its clock by a tenth of a stride: step sooner.
-    assert frequency(on_time + 0.04, 0.0) == pytest.approx(2.5 * 1.15)
-    assert frequency(on_time - 0.04, 0.0) == pytest.approx(2.5 * 0.85)
-    # Rear feet 2 cm closer to the front ones: the middle of the two lines is 1 cm ahead.
-    assert frequency(on_time - 0.01, 0.0, 0.325) == pytest.approx(2.5)
 
 
 def test_most_crossings_of_trenches_leap() -> None:

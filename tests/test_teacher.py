@@ -7,8 +7,8 @@ import pytest
 
 from tdgc.commands import INDEX, CommandDecoder, gait_index
 from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.leaps import straddling_frequency
 from tdgc.locomotion import Locomotion
-from tdgc.low_env import straddling_frequency
 from tdgc.teacher import STYLES, Teacher, travel_cost, trenches
 from tdgc.terrain import TileField, make_tile, trench_centres
 
