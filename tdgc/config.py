@@ -205,6 +205,9 @@ class HighLevelConfig:
 
     decimation: int = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
     cues: Literal["both", "semantic", "geometric", "none"] = "both"
+    # Share of the robots in training that are told an unknown family, so that the probes alone have
+    # to do: tiles of several families, or of none that has a name.
+    unknown_share: float = 0.0
     families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "tilt")
     levels: int = 11  # L_max: levels 0..10
     window: int = 4  # W episodes: short, since an episode of every robot takes minutes on two cores

@@ -387,9 +387,14 @@ class NavigationTask:
 
     @property
     def family_index(self) -> NDArray[np.int64]:
-        """Index of each robot's family into ``SEMANTIC``, (M,)."""
+        """Index into ``SEMANTIC`` of the family that each robot is told, (M,)."""
         names = [self.config.families[f] for f in self.family]
-        return np.array([SEMANTIC.index(n) if n in SEMANTIC else len(FAMILIES) for n in names])
+        told = np.array([SEMANTIC.index(n) if n in SEMANTIC else len(FAMILIES) for n in names])
+        if self.training:  # the last robots of each family are not told
+            each = self.num_robots / len(self.config.families)
+            place = np.arange(self.num_robots) // len(self.config.families)
+            told[place >= each * (1.0 - self.config.unknown_share)] = len(FAMILIES)
+        return told
 
     # ------------------------------------------------------------------ disturbances
 

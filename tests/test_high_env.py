@@ -129,6 +129,19 @@ def test_layout_and_cues():
     assert len(PROBES) == 32 and SEMANTIC[-1] == "unknown"
 
 
+def test_some_robots_in_training_are_not_told_their_family():
+    """Of 20 robots of two families the last two of each; in an evaluation all are told."""
+    config = HighLevelConfig(families=("tilt", "rough"), unknown_share=0.2)
+    where = columns("both")["family"]
+    for training, unknown in ((True, [16, 17, 18, 19]), (False, [])):
+        task = NavigationTask(config, LOW, 20, seed=0, training=training)
+        task.reset(np.arange(20))
+        told = task.observe()[:, where].argmax(axis=1)
+        task.close()
+        assert np.flatnonzero(told == SEMANTIC.index("unknown")).tolist() == unknown
+        assert (told[:16] == np.tile([SEMANTIC.index("tilt"), SEMANTIC.index("rough")], 8)).all()
+
+
 def test_goal_is_seen_in_the_heading_frame(task):
     where = columns("both")["goal"]
     task.goal[:] = task.locomotion.world.state.position[:, :2] + [0.0, 2.0]  # due north
