@@ -13,44 +13,66 @@ import dataclasses
 import functools
 import sys
 
+import numpy as np
 import torch as th
 from stable_baselines3 import PPO
 
 from tdgc import __version__, plots, policies
-from tdgc.config import LowLevelConfig, LowTrainConfig, to_dict
+from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, to_dict
+from tdgc.group import TaskGroup
 from tdgc.low_env import LowLevelTask, summarise
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.tiles import check_families
 from tdgc.training import Phase, add_arguments, configure, run
 from tdgc.vec import TaskVecEnv
-from tdgc.worker import MakeLink, WorkerError
+from tdgc.worker import MakeLink, Task, WorkerError
 
 
 def phases(config: LowTrainConfig, device: str) -> list[Phase]:
-    """First the plane, then tiles whose levels rise with success."""
+    """First the plane for all, then tiles whose levels rise with success for most.
+
+    Raises:
+        ConfigError: a share of the robots that is none.
+    """
+    if not 0.0 <= config.plane_share < 1.0:
+        raise ConfigError(f"'plane_share' must be from 0 to below 1, not {config.plane_share:g}")
     env = config.env
     physics = dataclasses.replace(env.physics, substeps=config.plane_substeps)
     plane = dataclasses.replace(env, terrain="plane", physics=physics)
     tiles = dataclasses.replace(env, terrain="tiles")
     return [
-        Phase(
-            functools.partial(build, config, plane, device), min(config.plane_steps, config.steps)
-        ),
-        Phase(functools.partial(build, config, tiles, device), config.steps),
+        Phase(functools.partial(build, config, others, device), min(until, config.steps))
+        for others, until in (((plane, plane), config.plane_steps), ((plane, tiles), config.steps))
     ]
+
+
+def make_task(
+    config: tuple[LowLevelConfig, LowLevelConfig], share: float, robots: int, seed: int
+) -> Task:
+    """The robots of a worker: a share of them in the first MDP, the others in the second."""
+    first = round(share * robots)
+    if not first:
+        return LowLevelTask(config[1], robots, seed)
+    seeds = np.random.SeedSequence(seed).generate_state(2)
+    return TaskGroup(
+        [
+            LowLevelTask(mdp, number, int(own))
+            for mdp, number, own in zip(config, (first, robots - first), seeds, strict=True)
+        ]
+    )
 
 
 def build(
     config: LowTrainConfig,
-    env_config: LowLevelConfig,
+    env_config: tuple[LowLevelConfig, LowLevelConfig],
     device: str,
     timeout: float,
     link: MakeLink,
 ) -> tuple[PPO, TaskVecEnv]:
     """Workers and learner of one phase."""
-    probe = LowLevelTask(dataclasses.replace(env_config, terrain="plane"), 1, seed=0)
+    probe = LowLevelTask(env_config[0], 1, seed=0)
     env = TaskVecEnv(
-        functools.partial(LowLevelTask, env_config),
+        functools.partial(make_task, env_config, config.plane_share),
         config.n_envs,
         config.workers,
         config.seed,

@@ -535,7 +535,8 @@ class LowLevelTask:
         """The sums since the last call."""
         stats, self.stats = self.stats, {}
         for g, name in enumerate(GAITS):
-            stats[f"share/{name}"] = float(self.command_share[g])
+            stats[f"share/{name}"] = self.num_robots * float(self.command_share[g])
+        stats["robots"] = float(self.num_robots)
         stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
         return stats
 
@@ -669,7 +670,7 @@ def summarise(sums: dict[str, float]) -> dict[str, float]:
         if key.startswith("term/"):
             values[f"reward/{key[5:]}"] = value / steps
         elif key.startswith("share/"):
-            values[f"command_share/{key[6:]}"] = value / sums["workers"]
+            values[f"command_share/{key[6:]}"] = value / sums["robots"]
     for gait in GAITS:
         n = max(sums.get(f"gait/{gait}/steps", 0.0), 1.0)
         values[f"tracking/{gait}_velocity_rmse"] = (sums.get(f"gait/{gait}/lin", 0.0) / n) ** 0.5

@@ -356,11 +356,9 @@ class RunCallback(BaseCallback):
 
     def _log(self) -> None:
         sums: dict[str, float] = {}
-        stats = self.env.stats()
-        for part in stats:
+        for part in self.env.stats():
             for key, value in part.items():
                 sums[key] = sums.get(key, 0.0) + value
-        sums["workers"] = float(len(stats))
         values = self.summarise(sums)
         steps, seconds = self._logged_at
         values["time/steps_per_s"] = (self.num_timesteps - steps) / (self.seconds - seconds)

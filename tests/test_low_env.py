@@ -236,7 +236,7 @@ def test_statistics_of_a_run() -> None:
     assert sum(steps) == 12
     task.step(still(task))
     assert task.take_stats()["steps"] == 4  # only what came since
-    values = summarise({**sums, "workers": 1.0, "falls": 3.0})
+    values = summarise({**sums, "falls": 3.0})
     assert values["reward/total"] == pytest.approx(sums["reward"] / 12)
     assert values["falls_per_minute"] == pytest.approx(3 / (12 * 0.02 / 60))
     assert values["command_share/trot"] == 1.0

@@ -33,6 +33,7 @@ RANKS = {
     "worker": 2,
     "cluster": 3,
     "world": 4,
+    "group": 4,
     "rewards": 4,
     "locomotion": 5,
     "policies": 5,

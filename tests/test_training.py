@@ -279,7 +279,7 @@ TINY = [
     "--set", "plane_steps=64", "--set", "checkpoint_seconds=0", "--set", "log_steps=64",
     "--set", "ppo.n_steps=8", "--set", "ppo.batch_size=16", "--set", "ppo.n_epochs=2",
     "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.4",
-    "--set", "env.physics.substeps=4",
+    "--set", "env.physics.substeps=4", "--set", "plane_share=0.5",
 ]  # fmt: skip
 
 
@@ -337,9 +337,9 @@ def rows(run: Path) -> list[dict[str, Any]]:
 def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Two updates on the plane and three on tiles, in the middle of episodes. The first run writes
-    no checkpoint on its way. The second is stopped after the first update, killed on tiles, loses
-    its newest checkpoint, and goes on from the one before."""
+    """Two updates on the plane and three with half of the robots on tiles, in the middle of
+    episodes. The first run writes no checkpoint on its way. The second is stopped after the first
+    update, killed on tiles, loses its newest checkpoint, and goes on from the one before."""
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert train_low.main([*TINY, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     names = sorted(path.name for path in (whole / "checkpoints").iterdir())
@@ -349,8 +349,9 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     assert rows(whole)[1]["reward/track_lin_vel"] > 0.0 and "level/stair" in rows(whole)[1]
     stored = from_dict(LowTrainConfig, json.loads((whole / "config.json").read_text()))
     expected = LowTrainConfig(
-        seed=3, n_envs=4, workers=2, steps=160, plane_steps=64, checkpoint_seconds=1e6, log_steps=64
-    )
+        seed=3, n_envs=4, workers=2, steps=160, plane_steps=64, plane_share=0.5,
+        checkpoint_seconds=1e6, log_steps=64,
+    )  # fmt: skip
     assert dataclasses.replace(stored, env=expected.env, ppo=expected.ppo) == expected
     assert stored.ppo.actor == (8,) and stored.env.episode_seconds == 0.4
 
