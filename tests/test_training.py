@@ -422,18 +422,20 @@ def test_levels_go_on_into_the_next_phase(tmp_path: Path) -> None:
     assert train_low.main([*TINY, "--steps", "64", "--out", str(tmp_path)]) == 0
     tensors, header = read_checkpoint(newest(tmp_path))
     for state in workers_of(tensors, header):  # views of the tensors
-        state["level"][:], state["command_share"][:] = 8, 0.9
+        for part in state["tasks"]:
+            part["level"][:], part["command_share"][:] = 8, 0.9
     save_checkpoint(tmp_path / "checkpoints", tensors, header)
     assert train_low.main(["--resume", "--steps", "96", "--out", str(tmp_path)]) == 0
     for state in workers_of(*read_checkpoint(newest(tmp_path))):
-        assert (state["level"] >= 7).all() and (state["command_share"] >= 0.9).all()
+        for part in state["tasks"]:
+            assert (part["level"] >= 7).all() and (part["command_share"] >= 0.9).all()
         assert state["lengths"].max() == 8
 
 
 def test_a_run_of_version_1_goes_on(tmp_path: Path) -> None:
     """Its checkpoints have no episodes and lists for arrays, its configuration counts steps."""
-    arguments = [*TINY, "--steps", "64", "--set", "plane_steps=0", "--out", str(tmp_path)]
-    assert train_low.main(arguments) == 0
+    arguments = [*TINY, "--steps", "64", "--set", "plane_steps=0", "--set", "plane_share=0"]
+    assert train_low.main([*arguments, "--out", str(tmp_path)]) == 0
     tensors, header = read_checkpoint(newest(tmp_path))
     states = workers_of(tensors, header)
     header |= {"version": 1, "workers": [
@@ -579,8 +581,9 @@ def test_phases_of_a_run() -> None:
     config = with_overrides(LowTrainConfig(), ["plane_steps=100", "steps=300"])
     plane, tiles = train_low.phases(config, "cpu")
     assert (plane.until, tiles.until) == (100, 300)
-    _, on_plane, device = plane.build.args  # type: ignore[attr-defined]
-    _, on_tiles, _ = tiles.build.args  # type: ignore[attr-defined]
+    _, (first, on_plane), device = plane.build.args  # type: ignore[attr-defined]
+    _, (second, on_tiles), _ = tiles.build.args  # type: ignore[attr-defined]
+    assert first == second == on_plane  # of those that stay there
     assert (on_plane.terrain, on_plane.physics.substeps, device) == ("plane", 4, "cpu")
     assert (on_tiles.terrain, on_tiles.physics) == ("tiles", config.env.physics)
     assert dataclasses.replace(on_plane, terrain="tiles", physics=on_tiles.physics) == on_tiles
