@@ -117,6 +117,7 @@ def measure_landing(
     errors: list[list[float]] = [[] for _ in centres[0]]
     spreads: list[float] = []
     last_front = np.full(_ROBOTS, np.inf)
+    middle = 0.5 * config.commands.duration[0]  # of the shortest stance: all feet are down
     distance = centres[0, -1] + TRENCH_SPACING - START_X
     try:
         for step in range(round(distance / (_SLOWEST * SPEED) * steps_per_s)):
@@ -131,7 +132,6 @@ def measure_landing(
             loco.act(low.predict(loco.observe())[0])
             feet = state.foot_position[..., 0]
             up = state.position[:, 2] > 0.5 * config.robot.base_height
-            middle = 0.5 * config.commands.duration[0]  # of the shortest stance: all feet are down
             for i in np.flatnonzero(up & (before < middle) & (loco.clock.clock >= middle)):
                 front, rear = feet[i, :2].mean(), feet[i, 2:].mean()
                 # Front feet of the last landing and rear ones of this are to be on one line.

@@ -268,21 +268,23 @@ class World:
         for joint, angle, speed in zip(self._joints, state.q[i], state.qd[i], strict=True):
             client.resetJointState(body, joint, angle, speed)
 
+    def _to_centre(self, i: int) -> Array:
+        """From the trunk's frame to its centre of mass, in the world, (3,) m."""
+        return np.asarray(rotation_matrix(self.state.quaternion[i : i + 1])[0] @ self._centre)
+
     def _place_trunk(self, i: int, position: Array) -> None:
         """Bring the trunk of robot ``i`` to ``position`` (3,), turned as ``state`` has it."""
-        quaternion = self.state.quaternion[i]
         self._client_of[i].resetBasePositionAndOrientation(
             self._bodies[i],
-            position + rotation_matrix(quaternion[None])[0] @ self._centre,
-            quaternion_product(quaternion, self._axes),
+            position + self._to_centre(i),
+            quaternion_product(self.state.quaternion[i], self._axes),
         )
 
     def _move_trunk(self, i: int) -> None:
         """Let the trunk of robot ``i`` move as ``state`` has it."""
         lin_vel, ang_vel = self.state.lin_vel[i], self.state.ang_vel[i]
-        arm = rotation_matrix(self.state.quaternion[i : i + 1])[0] @ self._centre
         self._client_of[i].resetBaseVelocity(
-            self._bodies[i], lin_vel + np.cross(ang_vel, arm), ang_vel
+            self._bodies[i], lin_vel + np.cross(ang_vel, self._to_centre(i)), ang_vel
         )
 
     def _read_trunks(self, live: NDArray[np.integer]) -> None:
