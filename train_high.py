@@ -20,7 +20,7 @@ import torch as th
 
 from tdgc import __version__, plots
 from tdgc.commands import INDEX, CommandDecoder, default_command
-from tdgc.config import PRESETS, HighTrainConfig, to_dict
+from tdgc.config import PRESETS, ConfigError, HighTrainConfig, to_dict
 from tdgc.high_env import NavigationTask, check_pair, load_low, summarise
 from tdgc.imitation import Apprentice, ApprenticePolicy
 from tdgc.leaps import LANDING, measure_landing
@@ -128,6 +128,9 @@ def main(arguments: list[str] | None = None) -> int:
         low, low_config = load_low(config.low)
         check_pair(config.env, low_config)
         check_families(config.env.families)
+        unknown = config.env.unknown_share
+        if not 0.0 <= unknown <= 1.0:
+            raise ConfigError(f"'env.unknown_share' must be from 0 to 1, not {unknown:g}")
         if config.imitation.steps:
             check_styles(config.env.families)
         meta: dict[str, Any] = {

@@ -132,6 +132,8 @@ def measure_landing(
             loco.act(low.predict(loco.observe())[0])
             feet = state.foot_position[..., 0]
             up = state.position[:, 2] > 0.5 * config.robot.base_height
+            if not (up & (state.position[:, 0] < START_X + distance)).any():
+                break  # fallen or there, all of them
             for i in np.flatnonzero(up & (before < middle) & (loco.clock.clock >= middle)):
                 front, rear = feet[i, :2].mean(), feet[i, 2:].mean()
                 # Front feet of the last landing and rear ones of this are to be on one line.

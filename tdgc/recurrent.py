@@ -65,7 +65,9 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         first = cuts.flatten().nonzero().squeeze(1)  # of each piece
         sizes = th.diff(first, append=first.new_tensor([cuts.numel()]))
         offset = th.arange(int(sizes.max()), device=first.device)
-        inside = offset < sizes.unsqueeze(1)
+        # Where each step of the sequences is among those of the pieces, (longest * pieces,).
+        piece = th.repeat_interleave(sizes)
+        place = (th.arange(cuts.numel(), device=first.device) - first[piece]) * len(first) + piece
         # (longest, pieces); what pads a piece is thrown away again.
         steps = (first + offset.unsqueeze(1)).clamp_(max=cuts.numel() - 1)
         goes_on = ((first % length == 0) & ~starts.flatten()[first]).to(obs.dtype).view(1, -1, 1)
@@ -73,7 +75,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
 
         def run(lstm: nn.LSTM, states: tuple[th.Tensor, ...]) -> th.Tensor:
             before = tuple(state[:, first // length] * goes_on for state in states)
-            return lstm(pieces, before)[0].transpose(0, 1)[inside]
+            return lstm(pieces, before)[0].flatten(0, 1).index_select(0, place)
 
         latent_pi = run(self.lstm_actor, lstm_states.pi)
         latent_vf = run(cast(nn.LSTM, self.lstm_critic), lstm_states.vf)

@@ -546,12 +546,13 @@ def test_flags_and_folders_that_cannot_be_used(
         error = capsys.readouterr().err
         assert error.startswith("train_low.py: ") and message in error
         assert error.count("\n") == 1
-    for families, message in (
-        ("mixed", "the teacher does not know mixed, only rough, "),
-        ("sand", "unknown terrain family 'sand'; choose from flat, rough, "),
+    for setting, message in (
+        ('env.families=["mixed"]', "the teacher does not know mixed, only rough, "),
+        ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
+        ("env.unknown_share=1.5", "'env.unknown_share' must be from 0 to 1, not 1.5"),
+        ("env.unknown_share=-0.1", "'env.unknown_share' must be from 0 to 1, not -0.1"),
     ):
-        flags = ["--set", f'env.families=["{families}"]', "--out", str(empty)]
-        assert train_high.main(flags) == 2
+        assert train_high.main(["--set", setting, "--out", str(empty)]) == 2
         assert capsys.readouterr().err.startswith(f"train_high.py: {message}")
     assert not empty.exists()
 
