@@ -65,7 +65,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         first = cuts.flatten().nonzero().squeeze(1)  # of each piece
         sizes = th.diff(first, append=first.new_tensor([cuts.numel()]))
         offset = th.arange(int(sizes.max()), device=first.device)
-        # Where each step of the sequences is among those of the pieces, (longest * pieces,).
+        # (n_seq * length,): where each step of the sequences is among (longest * pieces) steps.
         piece = th.repeat_interleave(sizes)
         place = (th.arange(cuts.numel(), device=first.device) - first[piece]) * len(first) + piece
         # (longest, pieces); what pads a piece is thrown away again.
