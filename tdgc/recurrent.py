@@ -11,6 +11,7 @@ LSTMs see padding, and only where an episode starts within the rollout.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 from typing import Any, cast
 
@@ -21,6 +22,7 @@ from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.common.recurrent.type_aliases import RecurrentRolloutBufferSamples, RNNStates
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from torch import nn
 
 
@@ -30,7 +32,8 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
     It takes the same arguments, has the same parameters and computes the same numbers.
 
     Raises:
-        ValueError: other LSTMs than plain ones of one layer, one each for actor and critic.
+        ValueError: other LSTMs than plain ones of one layer, one each for actor and critic, or
+            other actions than normally distributed ones with one deviation each.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -43,6 +46,8 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
                 "FastRecurrentPolicy has plain LSTMs of one layer, one each for actor and critic, "
                 "on shared features"
             )
+        if not isinstance(self.action_dist, DiagGaussianDistribution):
+            raise ValueError("FastRecurrentPolicy has normally distributed actions, without gSDE")
 
     def evaluate_actions(  # type: ignore[override]  # as sb3-contrib has it
         self, obs: th.Tensor, actions: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor
@@ -80,10 +85,29 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         latent_pi = run(self.lstm_actor, lstm_states.pi)
         latent_vf = run(cast(nn.LSTM, self.lstm_critic), lstm_states.vf)
         values = self.value_net(self.mlp_extractor.forward_critic(latent_vf))
-        distribution = self._get_action_dist_from_latent(
-            self.mlp_extractor.forward_actor(latent_pi)
-        )
-        return values, distribution.log_prob(actions), distribution.entropy()
+        mean = self.action_net(self.mlp_extractor.forward_actor(latent_pi))
+        return values, *gaussian(actions, mean, self.log_std)
+
+
+def gaussian(x: th.Tensor, mean: th.Tensor, log_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Log probability of ``x`` (n, size) and entropy (n,) of independent normal distributions.
+
+    As ``DiagGaussianDistribution`` has them, without its checks of every value, which take as long
+    as all the rest of the heads.
+    """
+    size = 0.5 * math.log(2.0 * math.pi) * len(log_std) + log_std.sum()
+    log_prob = -0.5 * ((x - mean) * (-log_std).exp()).square().sum(1) - size
+    return log_prob, (0.5 * len(log_std) + size).expand(len(x))
+
+
+class _Everything:
+    """A mask without padding: RecurrentPPO takes the steps where ``mask > 1e-8``, all of them.
+
+    Indexing by booleans, and its gradient, was a tenth of the update.
+    """
+
+    def __gt__(self, other: float) -> slice:
+        return slice(None)
 
 
 class WholeEnvBuffer(RecurrentRolloutBuffer):
@@ -95,32 +119,42 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
         """Minibatches of about ``batch_size`` steps, each environment once, in random order."""
         total = self.n_envs * self.buffer_size
         minibatches = total // (batch_size or total)
-        for envs in np.array_split(np.random.permutation(self.n_envs), minibatches):
-            yield self._rollouts(envs)
 
-    def _rollouts(self, envs: NDArray[np.int64]) -> RecurrentRolloutBufferSamples:
-        def steps(array: NDArray[np.float32]) -> th.Tensor:
-            """(n_steps, n_envs, ...) to (len(envs) * n_steps, ...), environment by environment."""
-            return self.to_torch(self.swap_and_flatten(array[:, envs]))
+        def by_env(array: NDArray[np.float32]) -> th.Tensor:
+            """(n_steps, n_envs, ...) -> (n_envs, n_steps, ...)."""
+            return self.to_torch(array.swapaxes(0, 1))
 
-        def before(array: NDArray[np.float32]) -> th.Tensor:
-            """The first of (n_steps, 1, n_envs, hidden)."""
-            return self.to_torch(array[0][:, envs])
-
-        return RecurrentRolloutBufferSamples(
-            observations=steps(self.observations),
-            actions=steps(self.actions),
-            old_values=steps(self.values).flatten(),
-            old_log_prob=steps(self.log_probs).flatten(),
-            advantages=steps(self.advantages).flatten(),
-            returns=steps(self.returns).flatten(),
-            lstm_states=RNNStates(
-                (before(self.hidden_states_pi), before(self.cell_states_pi)),
-                (before(self.hidden_states_vf), before(self.cell_states_vf)),
-            ),
-            episode_starts=steps(self.episode_starts).flatten(),
-            mask=th.ones(len(envs) * self.buffer_size, device=self.device),
-        )
+        steps = [
+            by_env(array)
+            for array in (
+                self.observations, self.actions, self.values, self.log_probs, self.advantages,
+                self.returns, self.episode_starts,
+            )
+        ]  # fmt: skip
+        states = [
+            self.to_torch(array[0])  # before the first of (n_steps, 1, n_envs, hidden)
+            for array in (
+                self.hidden_states_pi, self.cell_states_pi,
+                self.hidden_states_vf, self.cell_states_vf,
+            )
+        ]  # fmt: skip
+        for drawn in np.array_split(np.random.permutation(self.n_envs), minibatches):
+            envs = self.to_torch(drawn)
+            obs, actions, values, log_probs, advantages, returns, starts = (
+                array.index_select(0, envs).flatten(0, 1) for array in steps
+            )
+            h_pi, c_pi, h_vf, c_vf = (state.index_select(1, envs) for state in states)
+            yield RecurrentRolloutBufferSamples(
+                observations=obs,
+                actions=actions,
+                old_values=values,
+                old_log_prob=log_probs,
+                advantages=advantages,
+                returns=returns,
+                lstm_states=RNNStates((h_pi, c_pi), (h_vf, c_vf)),
+                episode_starts=starts,
+                mask=cast(th.Tensor, _Everything()),
+            )
 
 
 class FastRecurrentPPO(RecurrentPPO):

@@ -3,8 +3,10 @@
 import dataclasses
 import functools
 import json
+import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -75,12 +77,33 @@ def test_the_high_levels_update(
     monkeypatch.setattr(bench, "fill", keep)
     assert bench.main(["--update", "--out", str(tmp_path)]) == 0
     result = json.loads((tmp_path / "update.json").read_text())
-    assert result["ratio"] == result["stock"] / result["fast"] > 0.0
+    assert sorted(result) == ["fast", "ratio", "stock"] and min(result.values()) > 0.0
     assert [type(model) for model in learners] == [RecurrentPPO, FastRecurrentPPO]
     for model, start in zip(learners, before, strict=True):
         assert all((p != start[name]).any() for name, p in model.policy.state_dict().items())
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["update", "stock", "fast"]
+
+
+def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that the updates move, of which the first does not count."""
+    taken = {
+        RecurrentPPO: iter([9.0, 4.0, 6.0, 30.0]),
+        FastRecurrentPPO: iter([9.0, 2.0, 2.0, 5.0]),
+    }
+    now = 0.0
+
+    def train(model: RecurrentPPO) -> None:
+        nonlocal now
+        now += next(taken[type(model)])
+
+    for learner in taken:
+        monkeypatch.setattr(learner, "train", train)
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    config = HighTrainConfig(n_envs=4)
+    spaces = tuple(gym.spaces.Box(-1.0, 1.0, (size,), np.float32) for size in (5, 13))
+    result = bench.update_seconds(config, spaces, updates=3)
+    assert result == {"stock": 6.0, "fast": 2.0, "ratio": 3.0}  # turns of 2, 3 and 6 times
 
 
 def test_more_workers_than_robots(capsys: pytest.CaptureFixture[str]) -> None:

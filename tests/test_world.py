@@ -106,7 +106,7 @@ def test_heightfield_of_several_clients_and_after_a_redraw() -> None:
     world = World(12, ROBOT, PHYSICS, tiles(families * 2))
     field = world.field
     assert field is not None and CLIENT_ROBOTS < 12
-    assert [client.first_row for client in world._clients] == [0, 6]
+    assert [client.robots for client in world._clients] == [(0, 6), (6, 12)]
     assert_rays_hit_the_field(world, 1)
     for row, family in enumerate(reversed(families * 2)):
         field.place(row, 0, make_tile(family, 0.8, np.random.default_rng(row)))
