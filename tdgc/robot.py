@@ -6,7 +6,6 @@ Every array has a leading axis of M robots. Legs in the order of ``tdgc.gaits.FE
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -58,12 +57,6 @@ def joint_targets(config: RobotConfig, pose: Array, actions: Array) -> Array:
     return np.asarray(pose + scale * clipped)
 
 
-@functools.cache
-def _motor_limits(config: RobotConfig) -> tuple[Array, Array]:
-    """Limits of all joints' torques, (12,) N m, and speeds, (12,) rad/s."""
-    return np.tile(config.torque_limit, 4), np.tile(config.speed_limit, 4)
-
-
 def pd_torque(error: Array, speed: Array, strength: Array, config: RobotConfig) -> Array:
     """Joint torques of the PD law, limited as the motors are.
 
@@ -76,12 +69,13 @@ def pd_torque(error: Array, speed: Array, strength: Array, config: RobotConfig) 
     Returns:
         (M, 12) N m. A joint at its speed limit gets no torque that would drive it faster.
     """
-    torque_limit, speed_limit = _motor_limits(config)
-    limit = torque_limit * strength
+    limit = np.array(4 * config.torque_limit) * strength
     torque = strength * (config.kp * error - config.kd * speed)
-    np.clip(torque, -limit, limit, out=torque)
-    runaway = (np.abs(speed) >= speed_limit) & (torque * speed > 0.0)
-    torque[runaway] = 0.0
+    np.minimum(torque, limit, out=torque)  # np.clip takes twice as long for so few
+    np.maximum(torque, -limit, out=torque)
+    fast = np.abs(speed) >= np.array(4 * config.speed_limit)
+    if fast.any():
+        torque[fast & (torque * speed > 0.0)] = 0.0
     return torque
 
 

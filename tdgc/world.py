@@ -400,11 +400,13 @@ class World:
                 np.fromiter(map(itemgetter(k), flat), np.float64, len(flat)).reshape(q.shape)
                 for k in (0, 1)
             )
-            force = np.zeros(self.num_robots)
+            pressed: dict[int, float] = {}  # row -> N on its trunk, none most of the time
             for link in self._trunk_links:
                 for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=link):
-                    force[client.rows[contact[2]]] += contact[9]
-            np.maximum(state.trunk_force, force, out=state.trunk_force)
+                    row = client.rows[contact[2]]
+                    pressed[row] = pressed.get(row, 0.0) + contact[9]
+            for row, force in pressed.items():
+                state.trunk_force[row] = max(force, state.trunk_force[row])
         state.q[live], state.qd[live], state.torque[live] = q, qd, torque
 
     def _read_contacts(self) -> None:
