@@ -32,7 +32,7 @@ COMMANDS: dict[str, str | None] = {
         "--levels 6 --families tilt --episodes 1 --workers 1 --out {tmp}/first"
     ),
     ".venv/bin/pip install -c constraints.txt -e '.[dev]'": BY_CI,
-    ".venv/bin/python -m pytest": BY_CI,
+    ".venv/bin/python -m pytest -n 2": BY_CI,
     "python train_low.py": f"{TRAIN} --out {{tmp}}/low",
     "python train_low.py --resume --time-limit 3600": "--steps 256 --out {tmp}/low",
     "tensorboard --logdir runs": "--inspect --logdir {tmp}/low",
@@ -172,7 +172,7 @@ def test_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ci_finds_the_test_command() -> None:
-    chains = [line for line in README.splitlines() if re.search("^python3 .* -m pytest$", line)]
+    chains = [line for line in README.splitlines() if re.search("^python3 .* -m pytest -n 2$", line)]
     assert len(chains) == 1
 
 
