@@ -48,6 +48,7 @@ from tdgc.vec import TaskVecEnv
 from tdgc.worker import MakeLink, ProcessLink, memory_mb
 
 _COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
+UPDATES = 80  # turns of ``--update``: other work shares the cores
 #: What ``--load`` compares.
 LOAD_ROBOTS, LOAD_WORKERS, LOAD_THREADS = (10, 100, 1000), (1, 2, 4, 8), (1, 2, 4, 8, 16)
 _SETTLE_STEPS = 20  # not timed: robots drop onto their feet
@@ -355,7 +356,7 @@ def main(arguments: list[str] | None = None) -> int:
     if args.load:
         name, result = "load.json", compare_loads(args.seconds)
     elif args.update:
-        name, result = "update.json", compare_updates(updates=80)  # cores that others use, too
+        name, result = "update.json", compare_updates(UPDATES)
     elif args.cluster is not None:
         name, result = "cluster.json", compare_places(args.robots, args.workers, args.seconds)
     else:

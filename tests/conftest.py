@@ -13,3 +13,8 @@ def signals() -> Iterator[None]:
     yield
     for number, handler in before:
         signal.signal(number, handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The file that takes longest goes first, so that other processes have work meanwhile."""
+    items.sort(key=lambda item: item.path.name != "test_readme.py")

@@ -67,6 +67,7 @@ def test_the_high_levels_update(
     config = HighTrainConfig(n_envs=4)
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, n_steps=8, lstm=8))
     monkeypatch.setattr(bench, "HighTrainConfig", lambda: config)
+    monkeypatch.setattr(bench, "UPDATES", 2)
     learners, before, fill = [], [], bench.fill
 
     def keep(model: RecurrentPPO, rng: np.random.Generator) -> None:

@@ -172,7 +172,9 @@ def test_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ci_finds_the_test_command() -> None:
-    chains = [line for line in README.splitlines() if re.search("^python3 .* -m pytest -n 2$", line)]
+    chains = [
+        line for line in README.splitlines() if re.search("^python3 .* -m pytest -n 2$", line)
+    ]
     assert len(chains) == 1
 
 
