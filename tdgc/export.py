@@ -166,7 +166,7 @@ def clock_signal(clock: Tensor, command: Tensor) -> Tensor:
 
 
 class Pose(nn.Module):
-    """q0, as ``Locomotion.pose``: (1,), (15,) -> (12,) rad."""
+    """q0, as ``Locomotion.pose``: (1,), (1,), (15,) -> (12,) rad."""
 
     def __init__(self, robot: RobotConfig) -> None:
         super().__init__()
@@ -181,11 +181,12 @@ class Pose(nn.Module):
         self.out = _constant(geometry.abduction * SIDE)
         self.lowest, self.highest = map(_constant, geometry.joint_limits[2::3].T)
 
-    def forward(self, clock: Tensor, command: Tensor) -> Tensor:
+    def forward(self, clock: Tensor, grown: Tensor, command: Tensor) -> Tensor:
+        """``grown``: share of the swing that is asked so far, as in ``PhaseClock.swing``."""
         if not self.follows:
             return self.nominal
         swing = (2.0 * foot_phases(clock, command) - 1.0).clamp(0.0, 1.0)
-        raised = th.sin(0.5 * _TURN * swing)
+        raised = grown * th.sin(0.5 * _TURN * swing)
         change = command - self.default
         x = self.feet[:, 0] + 0.5 * change[INDEX["stance_length"]] * self.front
         y = self.feet[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
@@ -218,6 +219,9 @@ class LowLevel(nn.Module):
         self.dt = _constant(config.physics.control_dt)
         self.limit = _constant(robot.action_limit)
         self.pose = Pose(robot)
+        self.whole = _constant(1.0)
+        ramped = robot.commanded_pose and robot.swing_ramp > 0.0
+        self.ramp = _constant(robot.swing_ramp) if ramped else None
         # These maps are affine, so their values at 0 and at 1 say all.
         ones = np.full((1, NUM_JOINTS), robot.action_limit)
         self.joint_scale = _constant(joint_targets(robot, 0.0 * ones, ones)[0] / robot.action_limit)
@@ -233,17 +237,33 @@ class LowLevel(nn.Module):
             Signal("commands", NUM_COMMANDS, None, "to follow in this step", "commands"),
             Signal("clock", 1, "1", "share of the gait cycle, in [0, 1)", None, "next_clock", 0.0),
         ]
+        if self.ramp is not None:
+            first = tuple(default_command().tolist())
+            form = (NUM_COMMANDS, None, "the last", "commands", "commands", first)
+            self.inputs += [
+                Signal("last_commands", *form),
+                Signal("cycles", 1, "1", "of the gait since it began", None, "next_cycles", 0.0),
+            ]
         self.outputs = [
             Signal("action", NUM_JOINTS, "1", "within its limits", "joints"),
             Signal("joint_targets", NUM_JOINTS, "rad", "for the joint control", "joints"),
             Signal("next_clock", 1, "1", "share of the gait cycle at the end of this step"),
         ]
+        if self.ramp is not None:
+            self.outputs.append(
+                Signal("next_cycles", 1, "1", "of the gait so far, after this step")
+            )
 
     def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
         """``inputs`` -> ``outputs``."""
         x = _by_name(self.inputs, values)
         command, clock = x["commands"], x["clock"]
-        pose = self.pose(clock, command)
+        grown = self.whole
+        if self.ramp is not None:
+            same = (command[12:] == x["last_commands"][12:]).all()
+            cycles = x["cycles"] * same
+            grown = (cycles / self.ramp).clamp(max=1.0)
+        pose = self.pose(clock, grown, command)
         parts = [
             x["gravity"],
             x["joint_angles"] - pose,
@@ -257,8 +277,10 @@ class LowLevel(nn.Module):
         if "gyro" in x:
             parts.append(GYRO_SCALE * x["gyro"])
         action = self.actor(th.cat(parts).float()).double().clamp(-self.limit, self.limit)
-        clock = clock + self.dt * command[INDEX["frequency"]]
-        return action, pose + self.joint_scale * action, clock - clock.floor()
+        run = self.dt * command[INDEX["frequency"]]
+        clock = clock + run
+        step = (action, pose + self.joint_scale * action, clock - clock.floor())
+        return step if self.ramp is None else (*step, cycles + run)
 
     def _gait(self, command: Tensor) -> Tensor:
         """Index of the gait as a share of the last one's, as the observation has it: (1,)."""

@@ -102,18 +102,24 @@ class PhaseClock:
 
     Attributes:
         clock: (M,) cycle fraction.
+        embedding: (M, 3) e(g) of the gait that is under way.
+        cycles: (M,) cycles since it began.
         phases: (M, 4) warped foot phases of the last ``advance``/``update``.
         contact: (M, 4) desired contact C at these phases.
     """
 
     def __init__(self, num_robots: int) -> None:
         self.clock = np.zeros(num_robots)
+        self.embedding = np.zeros((num_robots, 3))
+        self.cycles = np.zeros(num_robots)
         self.phases = np.zeros((num_robots, 4))
         self.contact = desired_contact(self.phases)
 
     def reset(self, index: NDArray[np.integer], clock: NDArray[np.floating] | float = 0.0) -> None:
-        """Set the clock of the robots in ``index``; call ``update`` to refresh the phases."""
+        """Set the clock of the robots in ``index``, whose gait begins; call ``update`` to refresh
+        the phases."""
         self.clock[index] = clock
+        self.cycles[index] = 0.0
 
     def advance(
         self,
@@ -124,13 +130,22 @@ class PhaseClock:
     ) -> None:
         """Move every clock on by ``dt`` seconds at ``frequency`` (M,) Hz."""
         self.clock = np.mod(self.clock + dt * frequency, 1.0)
+        self.cycles = self.cycles + dt * frequency
         self.update(embedding, duration)
 
     def update(self, embedding: NDArray[np.floating], duration: NDArray[np.floating]) -> None:
         """Recompute the foot phases after a change of gait or duty factor."""
+        self.cycles[(embedding != self.embedding).any(axis=1)] = 0.0
+        self.embedding[:] = embedding
         self.phases = foot_phases(self.clock, embedding, duration)
         self.contact = desired_contact(self.phases)
 
     def signal(self) -> NDArray[np.float64]:
         """phi_t: sin(2 pi phase) of each foot, (M, 4), as the low level sees it."""
         return np.sin(2.0 * np.pi * self.phases)
+
+    def swing(self, ramp: float) -> NDArray[np.float64]:
+        """Height of each foot as a share of its apex, (M, 4), which grows over the first ``ramp``
+        cycles of a gait: legs that are all drawn up before the trunk rises let it drop."""
+        grown = np.minimum(self.cycles / ramp, 1.0) if ramp > 0.0 else np.ones_like(self.cycles)
+        return grown[:, None] * swing_profile(self.phases)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tdgc.commands import INDEX, NUM_COMMANDS, default_command, gait_index, observed_command
 from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
-from tdgc.gaits import GAITS, PhaseClock, swing_profile
+from tdgc.gaits import GAITS, PhaseClock
 from tdgc.robot import (
     NUM_JOINTS,
     Array,
@@ -132,14 +132,18 @@ class Locomotion:
         """Names and sizes of the parts of ``observe``'s rows."""
         return ACTOR_LAYOUT + (GYRO_LAYOUT if self.gyro else ())
 
+    def swing(self) -> Array:
+        """Profile of the swing, (M, 4): height of each foot as a share of the commanded apex."""
+        return self.clock.swing(self.robot.swing_ramp)
+
     def pose(self) -> Array:
         """q0, the pose that actions start from and joint errors refer to, (M, 12) rad."""
         if not self.robot.commanded_pose:
             return np.tile(self.nominal, (self.num_robots, 1))
         # An action is taken from the pose that was observed, if nobody changed anything between.
-        follows = np.concatenate([self.command, self.clock.phases], axis=1)
+        swing = self.swing()
+        follows = np.concatenate([self.command, swing], axis=1)
         if not np.array_equal(follows, self._pose_of):
-            swing = swing_profile(self.clock.phases)
             geometry = self.world.state.geometry
             self._pose = commanded_pose(self.robot, geometry, self.command, swing)
             self._pose_of = follows
@@ -219,6 +223,8 @@ class Locomotion:
             "actions": self.actions,
             "targets": self.targets,
             "clock": self.clock.clock,
+            "cycles": self.clock.cycles,
+            "gait": self.clock.embedding,
             "delay": self.delay,
             "joint_offset": self.joint_offset,
             "friction": self.friction,
@@ -237,7 +243,9 @@ class Locomotion:
         Raises:
             ValueError: a state of other robots.
         """
-        fill(self._arrays(), state)
+        # States from before gaits were counted are of robots whose swing had no ramp.
+        uncounted = {"cycles": np.zeros(self.num_robots), "gait": self.clock.embedding}
+        fill(self._arrays(), uncounted | state)
         self.world.state.derive()
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
         self.world.set_dynamics(np.arange(self.num_robots), self.friction, self.payload)

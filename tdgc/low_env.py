@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tdgc import rewards
 from tdgc.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.config import LowLevelConfig
-from tdgc.gaits import GAITS, gait_embedding, swing_profile
+from tdgc.gaits import GAITS, gait_embedding
 from tdgc.leaps import LANDING, straddling_frequency
 from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
 from tdgc.robot import NUM_JOINTS, Array, wrap_angle
@@ -75,9 +75,9 @@ _HEADING_GAIN = 1.0  # 1/s, yaw rate asked per rad of heading error
 
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
 
-# Of the commands drawn, in the order of GAITS. Free: pace and bound take longest to learn.
+# Of the commands drawn, in the order of GAITS. Free: pronk and bound take longest to learn.
 # Crossing: trot climbs best, and with all gaits alike the worst one decides how far levels rise.
-_FREE_GAITS = (0.2, 0.2, 0.25, 0.35)
+_FREE_GAITS = (0.15, 0.3, 0.2, 0.35)
 _CROSSING_GAITS = (0.8, 0.05, 0.075, 0.075)
 # Over trenches most crossings leap: pronk with a stride of about the stance length puts front and
 # rear feet on the same lines, and a trench fits between two of them if the steps are timed, which
@@ -91,7 +91,7 @@ _CENTRES = np.array([trench_centres(level / MAX_LEVEL) for level in range(MAX_LE
 # Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet land
 # on the same lines, so that a trench fits between two of them. Drawn evenly, such commands are too
 # rare: of 0.86 m/s at 2 Hz the robot did 0.5. As shares of the ranges: 0.7-1 m/s at 2-2.75 Hz.
-_LEAP_SHARE = 0.15
+_LEAP_SHARE = 0.05
 _LEAP = {"vx": (0.85, 1.0), "frequency": (0.0, 0.375)}
 
 # Command curriculum: a gait's velocity range grows when it tracks well over an evaluation batch.
@@ -331,7 +331,7 @@ class LowLevelTask:
             command=loco.command,
             phases=loco.clock.phases,
             contact=loco.clock.contact,
-            swing=swing_profile(loco.clock.phases),
+            swing=loco.swing(),
             base_height=base_height,
             foot_height=foot_height,
             standing_height=c.robot.base_height,

@@ -160,6 +160,11 @@ def test_low_level_is_the_executors_step(tmp_path: Path, gyro: bool, symmetric: 
     loco = Locomotion(m, config.robot, config.physics, None, gyro)
     try:
         disturb(loco, rng)
+        before = loco.command.copy()
+        loco.clock.update(before[:, 12:], before[:, 5])
+        cycles = rng.uniform(0.1, 2.0, m)  # swing grows over the first
+        loco.clock.cycles = cycles.copy()
+        loco.command[:6] = random_commands(rng, 7)[1:]  # other gaits than before
         loco.actions = rng.uniform(-0.6, 0.6, (2, m, 12))
         sensed = [body(loco, k) for k in range(m)]
         history, clock = loco.actions, loco.clock.clock
@@ -168,10 +173,15 @@ def test_low_level_is_the_executors_step(tmp_path: Path, gyro: bool, symmetric: 
         for k in range(m):
             own = {"last_action": history[0, k], "action_before": history[1, k]}
             given = {"commands": loco.command[k], "clock": clock[k : k + 1]}
-            got = run(level, sensed[k] | own | given)
+            gait = {"last_commands": before[k], "cycles": cycles[k : k + 1]}
+            got = run(level, sensed[k] | own | given | gait)
             assert got["action"] == pytest.approx(loco.actions[0, k], abs=3e-6)
             assert got["joint_targets"] == pytest.approx(loco.targets[0, k], abs=1e-6)
             assert got["next_clock"] == pytest.approx(loco.clock.clock[k], abs=1e-15)
+            assert ("next_cycles" in got) == symmetric  # a fixed pose does not swing
+            if symmetric:
+                assert got["next_cycles"] == pytest.approx(loco.clock.cycles[k], abs=1e-12)
+                assert (k < 6) == (got["next_cycles"][0] < 0.081)
         at_limit = np.abs(loco.actions[0]) == 0.6
         assert 20 < at_limit.sum() < at_limit.size - 20
     finally:

@@ -155,3 +155,27 @@ def test_three_hertz_for_a_second_and_a_half() -> None:
     for _ in range(75):
         clock.advance(0.02, np.array([3.0]), gait_embedding([0]), np.array([0.5]))
     assert clock.clock[0] == pytest.approx(0.5, abs=1e-9)  # four and a half cycles
+
+
+def test_swing_grows_over_the_first_cycles_of_a_gait() -> None:
+    clock, frequency, duty = PhaseClock(2), np.array([2.0, 4.0]), np.full(2, 0.5)
+    trot, pronk = gait_embedding([0, 0]), gait_embedding([0, 1])
+    clock.update(trot, duty)
+    for _ in range(10):  # 0.4 and 0.8 cycles
+        clock.advance(0.02, frequency, trot, duty)
+    np.testing.assert_allclose(clock.cycles, [0.4, 0.8], atol=1e-12)
+    np.testing.assert_allclose(clock.phases[:, 0], [0.9, 0.3], atol=1e-12)
+    height = math.sin(0.8 * math.pi)  # 0.8 of its swing
+    np.testing.assert_allclose(clock.swing(1.0)[0], [0.4 * height, 0, 0, 0.4 * height], atol=1e-12)
+    np.testing.assert_allclose(clock.swing(0.5)[0], [0.8 * height, 0, 0, 0.8 * height], atol=1e-12)
+    np.testing.assert_allclose(clock.swing(0.2)[0], [height, 0, 0, height], atol=1e-12)
+    assert (clock.swing(0.0) == swing_profile(clock.phases)).all()
+    clock.update(pronk, duty)  # another gait for the second
+    np.testing.assert_allclose(clock.cycles, [0.4, 0.0], atol=1e-12)
+    assert (clock.swing(1.0)[1] == 0.0).all() and (clock.swing(0.0)[1] == 0.0).sum() == 0
+    clock.advance(0.02, frequency, pronk, duty)
+    np.testing.assert_allclose(clock.cycles, [0.44, 0.08], atol=1e-12)
+    height = math.sin(2 * 0.38 * math.pi)
+    np.testing.assert_allclose(clock.swing(1.0)[1], np.full(4, 0.08 * height), atol=1e-12)
+    clock.reset(np.array([0]), 0.7)
+    assert clock.cycles.tolist() == [0.0, pytest.approx(0.08)]
