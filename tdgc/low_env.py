@@ -75,9 +75,9 @@ _HEADING_GAIN = 1.0  # 1/s, yaw rate asked per rad of heading error
 
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
 
-# Of the commands drawn, in the order of GAITS. Free: pronk and bound take longest to learn.
+# Of the commands drawn, in the order of GAITS. Free: trot is what crossings are mostly made in.
 # Crossing: trot climbs best, and with all gaits alike the worst one decides how far levels rise.
-_FREE_GAITS = (0.15, 0.3, 0.2, 0.35)
+_FREE_GAITS = (0.1, 0.3, 0.3, 0.3)
 _CROSSING_GAITS = (0.8, 0.05, 0.075, 0.075)
 # Over trenches most crossings leap: pronk with a stride of about the stance length puts front and
 # rear feet on the same lines, and a trench fits between two of them if the steps are timed, which
