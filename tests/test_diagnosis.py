@@ -180,8 +180,18 @@ def test_a_fall_is_the_executions_fault_unless_the_command_led_elsewhere():
     elsewhere = ("decisions", "lost its footing on the way elsewhere")
     for outcome in ("fell", "collided"):  # the trunk hits a step just as it hits the ground
         assert verdict(walk("stair", outcome=outcome)) == on_the_way
-        assert verdict(walk("stair", outcome=outcome, goal_bearing=2.0)) == elsewhere
-        assert verdict(walk("stair", outcome=outcome, command_vx=-0.5)) == elsewhere
+        assert verdict(walk("stair", outcome=outcome, goal_bearing=1.8)) == elsewhere
+        assert verdict(walk("stair", outcome=outcome, command_vx=-0.19)) == elsewhere
+
+
+def test_who_leads_away_from_the_goal_is_not_judged_by_tracking():
+    away = ("decisions", "led away from the goal")
+    lost = ("execution", "lost track of velocity")
+    for outcome in ("fell", "timeout", "left_tile"):
+        assert verdict(walk(outcome=outcome, command_vx=-0.21, error_vx=0.3)) == away
+        assert verdict(walk(outcome=outcome, command_vx=-0.19, error_vx=0.3)) == lost
+        behind = {"command_vx": 0.5, "goal_bearing": 2.0}  # 0.5 cos 2 = -0.208
+        assert verdict(walk(outcome=outcome, error_vx=0.3, **behind)) == away
 
 
 def pillar_at() -> tuple[float, float]:
@@ -221,7 +231,7 @@ def test_evidence_gives_the_numbers():
     found = diagnose(walk(error_vx=0.3, error_vy=0.4, at_bound_yaw_rate=-1.0), HIPS)
     assert found.evidence == (
         "in the last 2 s: velocity off by 0.50 m/s (limit 0.18); yaw rate off by 0.00 rad/s "
-        "(limit 0.16); tilt off by 0.00 rad (limit 0.32); asked for +0.50 m/s towards the goal; "
+        "(limit 0.17); tilt off by 0.00 rad (limit 0.34); asked for +0.50 m/s towards the goal; "
         "yaw_rate at its bound 100 % of the time"
     )
     assert (found.time_s, found.place, found.seed) == (6.0, "zone", 0)

@@ -329,7 +329,7 @@ def test_commanded_and_exported_pose_of_another_robot(robot: RobotConfig) -> Non
     np.testing.assert_allclose((feet - rest)[..., 2], moved, atol=1e-9)
     graph = Pose(robot)
     for k in range(20):
-        given = th.from_numpy(clock.clock[k : k + 1]), th.from_numpy(command[k])
+        given = th.from_numpy(clock.clock[k : k + 1]), th.ones(()), th.from_numpy(command[k])
         np.testing.assert_allclose(graph(*given).numpy(), pose[k], atol=1e-6)
 
 

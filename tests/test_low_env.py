@@ -402,8 +402,8 @@ def test_commands_fill_their_ranges() -> None:
     assert (values[:, :12].max(axis=0) > bounds[:, 1] - 0.05 * width).all()
     standing = (values[:, :3] == 0.0).all(axis=1).mean()
     assert 0.05 < standing < 0.16
-    # The rarest is trot: a fifth of the free commands that do not leap, 102 of 600 on average.
-    assert np.bincount(gait_index(values), minlength=4).min() > 75
+    # The rarest is trot: a tenth of the free commands that do not leap, 57 of 600 on average.
+    assert np.bincount(gait_index(values), minlength=4).min() > 36
     task.close()
 
 
