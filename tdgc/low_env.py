@@ -77,7 +77,7 @@ _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap
 
 # Of the commands drawn, in the order of GAITS. Free: trot is what crossings are mostly made in.
 # Crossing: trot climbs best, and with all gaits alike the worst one decides how far levels rise.
-_FREE_GAITS = (0.1, 0.3, 0.3, 0.3)
+_FREE_GAITS = (0.1, 0.2, 0.3, 0.4)
 _CROSSING_GAITS = (0.8, 0.05, 0.075, 0.075)
 # Over trenches most crossings leap: pronk with a stride of about the stance length puts front and
 # rear feet on the same lines, and a trench fits between two of them if the steps are timed, which
