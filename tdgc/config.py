@@ -13,7 +13,7 @@ import math
 import reprlib
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -403,6 +403,33 @@ def from_dict(cls: type[Config], data: Mapping[str, Any], where: str = "") -> Co
             raise ConfigError(f"unknown configuration key '{path}'; allowed: {', '.join(names)}")
         values[key] = _coerce(hints[key], value, path)
     return cls(**values)
+
+
+def recorded(cls: type[Config], data: Mapping[str, Any], source: object) -> Config:
+    """Build ``cls`` from what a policy or a run has written down, which must name every key.
+
+    What was trained with one value must not be run with today's default of a key that came later.
+
+    Raises:
+        ConfigError: as ``from_dict``, or a key that is missing; the message begins with ``source``.
+    """
+    try:
+        config = from_dict(cls, data)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from error
+    for key, value in _missing(to_dict(config), data):
+        raise ConfigError(f"{source}: no key '{key}', by default {value}; say what it was")
+    return config
+
+
+def _missing(whole: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Dotted keys of ``whole`` that ``data`` lacks, and their values."""
+    for key, value in whole.items():
+        if isinstance(value, dict):
+            below = _missing(value, data.get(key, {}))
+            yield from ((f"{key}.{name}", default) for name, default in below)
+        elif key not in data:
+            yield key, json.dumps(value)
 
 
 def with_overrides(config: Config, assignments: Iterable[str]) -> Config:

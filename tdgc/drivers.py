@@ -17,7 +17,7 @@ from tdgc.config import (
     HighLevelConfig,
     LowLevelConfig,
     RobotConfig,
-    from_dict,
+    recorded,
 )
 from tdgc.high_env import SEMANTIC, check_pair, high_layout, observe_high
 from tdgc.leaps import measure_landing
@@ -176,8 +176,8 @@ def load_high(
     if high.kind != "lstm" or high.action_dim != NUM_ACTIONS:
         raise ConfigError(f"{path}: not a high-level policy of this package")
     try:
-        config = from_dict(HighLevelConfig, high.meta["config"])
-        trained_on = from_dict(LowLevelConfig, high.meta["low"]["config"])
+        config = recorded(HighLevelConfig, high.meta["config"], path)
+        trained_on = recorded(LowLevelConfig, high.meta["low"]["config"], f"{path}, meta.low")
         observation = high.meta["low"]["observation"]
     except (KeyError, TypeError) as error:
         raise ConfigError(f"{path}: its meta lacks what it was trained on") from error

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.commands import CONTINUOUS, INDEX, gait_index
-from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, from_dict
+from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, recorded
 from tdgc.drivers import Driver
 from tdgc.gaits import GAITS, gait_embedding
 from tdgc.locomotion import Locomotion
@@ -150,7 +150,7 @@ def low_config(low: Policy) -> LowLevelConfig:
     """
     if "config" not in low.meta:
         raise ValueError("the low-level policy's file has no configuration")
-    return from_dict(LowLevelConfig, low.meta["config"])
+    return recorded(LowLevelConfig, low.meta["config"], "the low level's configuration")
 
 
 def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:

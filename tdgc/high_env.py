@@ -21,7 +21,7 @@ from tdgc.config import (
     HighLevelConfig,
     HighRewardConfig,
     LowLevelConfig,
-    from_dict,
+    recorded,
 )
 from tdgc.curriculum import Curriculum
 from tdgc.gaits import GAITS
@@ -187,7 +187,7 @@ def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
     name, low = low, low if isinstance(low, Policy) else policies.load(low)
     if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
         raise ConfigError(f"{name}: not a low-level policy of this package")
-    return low, from_dict(LowLevelConfig, low.meta["config"])
+    return low, recorded(LowLevelConfig, low.meta["config"], name)
 
 
 class NavigationTask:

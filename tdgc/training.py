@@ -40,7 +40,7 @@ from tqdm import tqdm
 
 from tdgc import __version__, policies
 from tdgc.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
-from tdgc.config import Config, ConfigError, from_dict, read_json, to_dict, with_overrides
+from tdgc.config import Config, ConfigError, read_json, recorded, to_dict, with_overrides
 from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.errors import InputError
 from tdgc.state import State, join, split
@@ -523,10 +523,7 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     if args.resume:
         if not stored.is_file():
             raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
-        data = read_json(stored)
-        if isinstance(data, dict):  # of runs whose checkpoints were so many steps apart
-            data.pop("checkpoint_steps", None)
-        config = from_dict(type(config), data)
+        config = recorded(type(config), read_json(stored), stored)
     elif stored.exists():
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}

@@ -16,6 +16,7 @@ from tdgc.config import (
     PhysicsConfig,
     RobotConfig,
     from_dict,
+    recorded,
     to_dict,
     with_overrides,
 )
@@ -44,6 +45,19 @@ def test_missing_keys_keep_their_defaults() -> None:
     config = from_dict(LowTrainConfig, {"seed": 3, "env": {"robot": {"kd": 0.5}}})
     expected = LowTrainConfig(seed=3, env=LowLevelConfig(robot=RobotConfig(kd=0.5)))
     assert config == expected
+
+
+def test_what_was_recorded_must_be_whole() -> None:
+    config = LowTrainConfig(seed=3, env=LowLevelConfig(robot=RobotConfig(swing_ramp=0.0)))
+    data = to_dict(config)
+    assert recorded(LowTrainConfig, data, "run") == config
+    del data["env"]["robot"]["swing_ramp"]
+    message = "^run: no key 'env.robot.swing_ramp', by default 1.0; say what it was$"
+    with pytest.raises(ConfigError, match=message):
+        recorded(LowTrainConfig, data, "run")
+    del data["env"]["robot"]
+    with pytest.raises(ConfigError, match=r"no key 'env\.robot\.urdf', by default \"urdf/quadr"):
+        recorded(LowTrainConfig, data, "run")
 
 
 def test_a_whole_number_is_a_float_but_not_the_other_way_round() -> None:
