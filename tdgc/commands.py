@@ -68,6 +68,11 @@ def observed_command(command: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray((command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT)
 
 
+def commands_of(observed: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The inverse: commands (..., 15) from what the network sees of them."""
+    return np.asarray(observed * _OBSERVATION_UNIT + _OBSERVATION_ZERO)
+
+
 class CommandDecoder:
     """D: 13 actions -> 15 commands, affine within explicit bounds (paper Sec. IV-B).
 

@@ -436,13 +436,17 @@ _SWITCH_SECONDS = 2.0  # between gaits in the falls test
 _FALL_SHARE, _FALL_SECONDS = 0.6, 20.0  # of the episodes: 100 a gait make 20 minutes of walking
 
 
-def _commands(rng: np.random.Generator, ranges: CommandRanges, n: int) -> Array:
+def draw_commands(rng: np.random.Generator, ranges: CommandRanges, n: int) -> Array:
+    """The 12 continuous commands of ``n`` robots, over the full ranges, (n, 12)."""
     bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
     return np.asarray(rng.uniform(bounds[:, 0], bounds[:, 1], (n, len(CONTINUOUS))))
 
 
-def _walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Locomotion]:
-    """Yield before each control step, so that the caller may set commands and look."""
+def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Locomotion]:
+    """``m`` nominal robots that start from rest.
+
+    Yields before each control step, so that the caller may set commands and look.
+    """
     config = low_config(low)
     loco = Locomotion(m, config.robot, config.physics, None, config.gyro)
     rows = np.arange(m)
@@ -467,12 +471,12 @@ def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, fl
     config, g = low_config(low), GAITS.index(gait)
     rng = np.random.default_rng((EVAL_STREAM, seed, g))
     command = np.concatenate(
-        [_commands(rng, config.commands, episodes), np.tile(gait_embedding(g), (episodes, 1))],
+        [draw_commands(rng, config.commands, episodes), np.tile(gait_embedding(g), (episodes, 1))],
         axis=1,
     )
     settle = round(_SETTLE_SECONDS / config.physics.control_dt)
     lin = yaw = match = count = 0.0
-    for step, loco in enumerate(_walk_on_plane(low, episodes, _TRACKING_SECONDS, seed)):
+    for step, loco in enumerate(walk_on_plane(low, episodes, _TRACKING_SECONDS, seed)):
         state = loco.world.state
         if step > settle:
             lin += float(np.sum((state.heading_vel[:, :2] - command[:, :2]) ** 2))
@@ -498,10 +502,10 @@ def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
     rng = np.random.default_rng((EVAL_STREAM, seed, len(GAITS)))
     switch = round(_SWITCH_SECONDS / dt)
     command = np.zeros((m, 15))
-    command[:, :12] = _commands(rng, config.commands, m)
+    command[:, :12] = draw_commands(rng, config.commands, m)
     up = np.ones(m, dtype=bool)
     minutes = 0.0
-    for step, loco in enumerate(_walk_on_plane(low, m, _FALL_SECONDS, seed)):
+    for step, loco in enumerate(walk_on_plane(low, m, _FALL_SECONDS, seed)):
         up &= ~is_fallen(loco.world)
         minutes += up.sum() * dt / 60.0
         if step % switch == 0:

@@ -30,7 +30,7 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -488,6 +488,31 @@ def save(path: str | os.PathLike[str], policy: ActorCriticPolicy, meta: dict[str
         name: tensor.detach().to("cpu", th.float32).contiguous()
         for name, tensor in _tensors(policy).items()
     }
+    _store(path, header, tensors)
+
+
+def save_copy(
+    path: str | os.PathLike[str],
+    policy: Policy,
+    changed: Mapping[str, th.Tensor],
+    meta: dict[str, Any],
+) -> None:
+    """Write a loaded policy with some of its weights ``changed``, by name, and another ``meta``.
+
+    Raises:
+        ValueError, OSError: as ``save``; or a tensor that the policy has not or of another shape.
+    """
+    for name, tensor in changed.items():
+        if name not in policy.tensors or tensor.shape != policy.tensors[name].shape:
+            raise ValueError(f"no tensor {name} of shape {tuple(tensor.shape)} in this policy")
+    tensors = {
+        name: changed.get(name, tensor).detach().to("cpu", th.float32).contiguous()
+        for name, tensor in policy.tensors.items()
+    }
+    _store(path, dataclasses.replace(policy.header, meta=meta), tensors)
+
+
+def _store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Tensor]) -> None:
     for name, tensor in tensors.items():
         if not bool(tensor.isfinite().all()):
             raise ValueError(f"tensor {name} holds a number that is not finite; not saved")
@@ -697,6 +722,7 @@ class Policy:
     """A loaded policy: acts as SB3's does, without SB3.
 
     Attributes:
+        header: what its file says.
         kind: "mlp" or "lstm".
         meta: what the caller of ``save`` gave.
         obs_dim: width of the full observation, actor and critic-only part.
@@ -707,6 +733,7 @@ class Policy:
     """
 
     def __init__(self, header: Header, tensors: dict[str, th.Tensor]) -> None:
+        self.header = header
         self.kind = header.kind
         self.meta = header.meta
         self.obs_dim = header.obs_dim
@@ -766,7 +793,7 @@ class Policy:
                 f"(actor part) or {self.obs_dim} (all)"
             )
         batch: Array = np.array(np.atleast_2d(x)[:, : self.actor_dim], dtype=np.float32)
-        with _one_thread(), th.inference_mode():
+        with one_thread(), th.inference_mode():
             latent = th.from_numpy(batch)
             if self._hidden is not None:
                 h, c = self._previous(state, episode_start, len(batch), self._hidden)
@@ -806,9 +833,12 @@ class Policy:
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    # The networks are too small to share out: one thread costs nothing when cores are idle, is
-    # several times faster when they are not, and gives the same bits whatever the setting.
+def one_thread() -> Iterator[None]:
+    """PyTorch on one thread, as a context or a decorator.
+
+    The networks are too small to share out: one thread costs nothing when cores are idle, is
+    several times faster when they are not, and gives the same bits whatever the setting.
+    """
     threads = th.get_num_threads()
     th.set_num_threads(1)
     try:

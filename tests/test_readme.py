@@ -36,12 +36,15 @@ COMMANDS: dict[str, str | None] = {
     "python train_low.py": f"{TRAIN} --out {{tmp}}/low",
     "python train_low.py --resume --time-limit 3600": "--steps 256 --out {tmp}/low",
     "tensorboard --logdir runs": "--inspect --logdir {tmp}/low",
-    "python train_high.py --low runs/low/policy": (
-        f"{TRAIN_HIGH} --low {{tmp}}/low/policy --out {{tmp}}/high"
+    "python -m tdgc.calibration --low runs/low/policy --out runs/low/calibrated": (
+        "--low {tmp}/low/policy --robots 64 --turns 1 --workers 1 --out {tmp}/low/calibrated"
     ),
-    "python evaluate.py --low runs/low/policy --policies gp --levels 6-10": (
-        "--low {tmp}/low/policy --policies gp --levels 6 --families tilt --episodes 1 --workers 1 "
-        "--out {tmp}/evaluation"
+    "python train_high.py --low runs/low/calibrated": (
+        f"{TRAIN_HIGH} --low {{tmp}}/low/calibrated --out {{tmp}}/high"
+    ),
+    "python evaluate.py --low runs/low/calibrated --policies gp --levels 6-10": (
+        "--low {tmp}/low/calibrated --policies gp --levels 6 --families tilt --episodes 1 "
+        "--workers 1 --out {tmp}/evaluation"
     ),
     "python evaluate.py --tracking": "--episodes 1 --workers 1 --out {tmp}/tracking",
     "python evaluate.py --policies teacher --families stair,gap --episodes 20": (
@@ -56,8 +59,9 @@ COMMANDS: dict[str, str | None] = {
     "python evaluate.py --video --families stair,gap --levels 8": (
         "--policies gp --levels 10 --families gap --episodes 1 --workers 1 --out {tmp}/video"
     ),
-    "python -m tdgc.export --low runs/low/policy --high runs/high/policy --out runs/export": (
-        "--low {tmp}/low/policy --high {tmp}/high/policy --format torchscript --out {tmp}/export"
+    "python -m tdgc.export --low runs/low/calibrated --high runs/high/policy --out runs/export": (
+        "--low {tmp}/low/calibrated --high {tmp}/high/policy --format torchscript "
+        "--out {tmp}/export"
     ),
     "python -m tdgc.bench --out runs/bench": (
         "--robots 2 --workers 1 --seconds 0.1 --out {tmp}/bench"
@@ -84,6 +88,7 @@ OUTPUTS = (
     "low/config.json",
     "low/policy.json",
     "low/policy.safetensors",
+    "low/calibrated.safetensors",
     "low/checkpoints/step-000000000128",
     "low/checkpoints/step-000000000256",
     "low/tensorboard",

@@ -51,6 +51,7 @@ RANKS = {
     "trace": 11,
     "tuning": 11,
     "bench": 11,
+    "calibration": 11,
     "export": 11,
     "plots": 12,
     "diagnosis": 13,

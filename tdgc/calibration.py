@@ -1,0 +1,333 @@
+"""Calibration: a copy of a low level that walks as fast as it is told to.
+
+    python -m tdgc.calibration --low runs/low/policy --out runs/low/calibrated
+
+A blind policy that learned with random dynamics, pushes and penalties is slower than it is asked to
+be, in each gait differently, but repeatably: on the nominal robot the mean velocity at a command is
+the same to a centimetre a second. So robots walk with commands of all kinds, a network learns which
+velocity each of them leads to, and a copy of the policy learns, in the training MDP, to do at each
+command what the policy does at the command that leads there. What goes in and out of it stays.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import itertools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from tdgc import policies
+from tdgc.commands import CONTINUOUS, NUM_COMMANDS, commands_of, observed_command
+from tdgc.config import CommandRanges, LowLevelConfig
+from tdgc.cores import auto_workers, usable_cores, workers_flag
+from tdgc.evaluation import draw_commands, spread, walk_on_plane
+from tdgc.gaits import GAITS, gait_embedding
+from tdgc.group import TaskGroup
+from tdgc.high_env import load_low
+from tdgc.locomotion import ACTOR_LAYOUT, MIRRORS
+from tdgc.low_env import LowLevelTask, is_fallen
+from tdgc.policies import ACTIVATIONS, Policy
+from tdgc.robot import Array
+from tdgc.vec import TaskVecEnv
+from tdgc.worker import Task, WorkerError
+
+#: From velocity command to mean velocity, (n, 15) -> (n, 3): vx, vy in m/s, yaw rate in rad/s.
+Response = Callable[[Array], Array]
+
+_STREAM = 3  # of random numbers, apart from those of training and evaluation (``tdgc.terrain``)
+_BATCH = 400  # robots that walk at a time
+_WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2  # the mean is over the rest
+# Of the velocity ranges, in which responses are measured and to which commands may be corrected:
+# further out the policy was never trained, and what it does there is of little use.
+_MEASURED, _CORRECTED = 1.4, 1.2
+# Share by which a corrected command is pulled back to what was asked: where the robot cannot go
+# faster, asking for more must not pay.
+_PULL = 0.1
+_ROUNDS, _GAIN = 30, 0.5  # of the fixed-point iteration: with slopes of 0.3 to 1.5 it has converged
+_HIDDEN, _EPOCHS, _MINIBATCH = (128, 64), 300, 256  # of the network of the response
+_ROBOTS, _PLANE_SHARE = 120, 0.6  # in distillation, as in training
+_TURN = 60  # control steps between updates
+_KEPT = 40  # turns whose states are learned from
+_UPDATES, _STATES = 120, 1024  # minibatches a turn, and their size
+_RATE = 3e-4  # of Adam, falling to nothing
+
+_SIGN = np.array(MIRRORS["command"][1])
+_FIRST = sum(dict(ACTOR_LAYOUT[:5]).values())  # column of the first command in an observation
+_COMMAND = slice(_FIRST, _FIRST + NUM_COMMANDS)
+
+
+# ------------------------------------------------------------------ what a command leads to
+
+
+def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
+    """Commands given to ``robots`` on a plane and their mean velocities, (n, 15) and (n, 3).
+
+    Velocities are of the heading frame. A robot that fell is left out, so n may be less.
+    """
+    config = load_low(low)[1]
+    rng = np.random.default_rng((_STREAM, seed))
+    gait = gait_embedding(np.arange(robots) % len(GAITS))
+    command = np.concatenate([draw_commands(rng, config.commands, robots), gait], axis=1)
+    middle, _ = _velocity_ranges(config.commands)
+    command[:, :3] = middle + _MEASURED * (command[:, :3] - middle)
+    settle = round(_SETTLE_SECONDS / config.physics.control_dt)
+    up, total, steps = np.ones(robots, dtype=bool), np.zeros((robots, 3)), 0
+    for step, loco in enumerate(walk_on_plane(low, robots, _WALK_SECONDS, seed)):
+        state = loco.world.state
+        up &= ~is_fallen(loco.world)
+        if step > settle:
+            total += np.column_stack([state.heading_vel[:, :2], state.ang_vel[:, 2]])
+            steps += 1
+        loco.command[:] = command
+    return command[up], total[up] / steps
+
+
+def _velocity_ranges(ranges: CommandRanges) -> tuple[Array, Array]:
+    """Middle and half of the width of the velocity ranges, (3,) each."""
+    low, high = np.array([getattr(ranges, name) for name in CONTINUOUS[:3]]).T
+    return 0.5 * (low + high), 0.5 * (high - low)
+
+
+class ResponseModel:
+    """A network that predicts the mean velocity at a command (a ``Response``).
+
+    Attributes:
+        error: root mean square on an eighth of the measurements that it has not seen, (3,).
+    """
+
+    def __init__(self, given: Array, reached: Array, ranges: CommandRanges, seed: int) -> None:
+        bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
+        width = np.diff(bounds)[:, 0]
+        self._zero = np.concatenate([bounds.mean(axis=1), np.full(3, 0.25)])
+        self._unit = np.concatenate([0.5 * np.where(width > 0.0, width, 2.0), np.full(3, 0.25)])
+        with th.random.fork_rng():
+            th.manual_seed(seed)
+            sizes = (NUM_COMMANDS, *_HIDDEN)
+            layers = [
+                part for pair in itertools.pairwise(sizes) for part in (nn.Linear(*pair), nn.Tanh())
+            ]
+            self._net = nn.Sequential(*layers, nn.Linear(sizes[-1], 3))
+            self.error = self._fit(given, reached, np.random.default_rng(seed))
+
+    def __call__(self, command: Array) -> Array:
+        with th.inference_mode():
+            return self._unit[:3] * self._net(self._seen(command)).double().numpy() + command[:, :3]
+
+    def _seen(self, command: Array) -> th.Tensor:
+        return th.from_numpy(((command - self._zero) / self._unit).astype(np.float32))
+
+    @policies.one_thread()
+    def _fit(self, given: Array, reached: Array, rng: np.random.Generator) -> Array:
+        held = np.arange(len(given)) % 8 == 0
+        # A robot's mirror image does the mirror image of what it does.
+        sign = np.array([np.ones(NUM_COMMANDS), _SIGN])[:, None]
+        command = (sign * given[~held]).reshape(-1, NUM_COMMANDS)
+        lack = (sign[..., :3] * (reached - given[:, :3])[~held]).reshape(-1, 3) / self._unit[:3]
+        x, y = self._seen(command), th.from_numpy(lack.astype(np.float32))
+        optimiser = th.optim.AdamW(self._net.parameters(), lr=2e-3)
+        rate = th.optim.lr_scheduler.CosineAnnealingLR(optimiser, _EPOCHS)
+        for _ in range(_EPOCHS):
+            order = th.from_numpy(rng.permutation(len(x)))
+            for rows in th.split(order, _MINIBATCH):
+                # Less of the few that stumble than squares would make.
+                loss = nn.functional.smooth_l1_loss(self._net(x[rows]), y[rows], beta=0.2)
+                optimiser.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                optimiser.step()
+            rate.step()
+        return np.asarray(np.sqrt(np.mean((self(given[held]) - reached[held]) ** 2, axis=0)))
+
+
+def corrected(response: Response, command: Array, ranges: CommandRanges) -> Array:
+    """``command`` (n, 15) with velocities that lead to those asked for, as far as that goes."""
+    middle, half = _velocity_ranges(ranges)
+    low, high = middle - _CORRECTED * half, middle + _CORRECTED * half
+    asked, given = command[:, :3], command.copy()
+    for _ in range(_ROUNDS):
+        off = response(given) - asked + _PULL * (given[:, :3] - asked)
+        given[:, :3] = np.clip(given[:, :3] - _GAIN * off, low, high)
+    return given
+
+
+# ------------------------------------------------------------------ the copy
+
+
+def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> Task:
+    """The training MDP as it is late in a run: all commands, all levels, most robots on a plane."""
+    config = dataclasses.replace(config, command_start=1.0)
+    plane = round(_PLANE_SHARE * robots)
+    seeds = np.random.SeedSequence((_STREAM, seed)).generate_state(2)
+    on = [dataclasses.replace(config, terrain=terrain) for terrain in ("plane", "tiles")]
+    tasks = [
+        LowLevelTask(mdp, number, int(own))
+        for mdp, number, own in zip(on, (plane, robots - plane), seeds, strict=True)
+    ]
+    tasks[1].level[:] = np.arange(robots - plane) % config.levels
+    return TaskGroup(tasks)
+
+
+class Student(nn.Module):
+    """The actor of a low level, to be trained: observations (n, actor_dim) -> actions (n, 12)."""
+
+    def __init__(self, low: Policy) -> None:
+        super().__init__()
+        header = low.header
+        sizes = (low.actor_dim, *header.actor, low.action_dim)
+        self.layers = nn.ModuleList(nn.Linear(*pair) for pair in itertools.pairwise(sizes))
+        self.activation = ACTIVATIONS[header.activation]()
+        for i, layer in enumerate(self.layers):
+            layer.load_state_dict({k: low.tensors[f"actor.{i}.{k}"] for k in ("weight", "bias")})
+        self.mirror = None
+        if header.mirror is not None:
+            self.mirror = [th.tensor(part) for part in dataclasses.astuple(header.mirror)]
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        if self.mirror is None:
+            return self._act(x)
+        obs_index, obs_sign, action_index, action_sign = self.mirror
+        turned = self._act(x[:, obs_index] * obs_sign)
+        return 0.5 * (self._act(x) + turned[:, action_index] * action_sign)
+
+    def _act(self, x: th.Tensor) -> th.Tensor:
+        for layer in self.layers[:-1]:
+            x = self.activation(layer(x))
+        return th.as_tensor(self.layers[-1](x))
+
+    def tensors(self) -> dict[str, th.Tensor]:
+        """Its weights by their names in a policy's file."""
+        return {f"actor.{name[7:]}": tensor for name, tensor in self.state_dict().items()}
+
+
+@policies.one_thread()
+def distil(
+    low: Policy,
+    response: Response,
+    ranges: CommandRanges,
+    env: TaskVecEnv,
+    turns: int,
+    seed: int,
+) -> tuple[Student, float, float]:
+    """A student, a copy at first, that learns to do what ``low`` does at corrected commands.
+
+    It acts and learns from the states that it comes to (DAgger, Ross et al. 2011).
+
+    Returns:
+        The student, and the root mean square of its difference in actions: on the states of its
+        first turn before it has learned anything, and on those of its last.
+    """
+    student, rng = Student(low), np.random.default_rng((_STREAM, seed))
+    optimiser = th.optim.Adam(student.parameters(), lr=_RATE)
+    seen: list[tuple[th.Tensor, th.Tensor]] = []
+    first = last = 0.0
+    obs = env.reset()
+    for turn in range(turns):
+        states = []
+        for _ in range(_TURN):
+            states.append(obs[:, : low.actor_dim])
+            with th.inference_mode():
+                actions = student(th.from_numpy(states[-1])).numpy()
+            env.step_async(np.clip(actions, low.low, low.high))
+            obs = env.step_wait()[0]
+        x = np.concatenate(states)
+        given = x.copy()
+        given[:, _COMMAND] = observed_command(
+            corrected(response, commands_of(x[:, _COMMAND]), ranges)
+        )
+        state, wanted = th.from_numpy(x), th.from_numpy(low.predict(given)[0])
+        with th.inference_mode():
+            last = float((student(state) - wanted).square().mean().sqrt())
+        first = first if turn else last
+        seen = [*seen[1 - _KEPT :], (state, wanted)]
+        every, actions_wanted = (th.cat(parts) for parts in zip(*seen, strict=True))
+        optimiser.param_groups[0]["lr"] = _RATE * (1.0 - turn / turns)
+        for _ in range(_UPDATES):
+            rows = th.from_numpy(rng.integers(0, len(every), _STATES))
+            loss = (student(every[rows]) - actions_wanted[rows]).square().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+    return student, first, last
+
+
+# ------------------------------------------------------------------ the script
+
+
+def calibrate(
+    low: Policy, robots: int, turns: int, workers: int, seed: int
+) -> tuple[Student, dict[str, float]]:
+    """Measure, fit and distil: the student, and what is to be known of it (keys say the unit).
+
+    Raises:
+        WorkerError: a worker failed.
+    """
+    config = load_low(low)[1]
+    counts = [min(_BATCH, robots - first) for first in range(0, robots, _BATCH)]
+    jobs = [(count, seed * len(counts) + k) for k, count in enumerate(counts)]
+    walks = list(spread(functools.partial(_walk, low), jobs, workers))
+    given, reached = (np.concatenate(parts) for parts in zip(*walks, strict=True))
+    response = ResponseModel(given, reached, config.commands, seed)
+    probe = LowLevelTask(dataclasses.replace(config, terrain="plane"), 1, seed=0)
+    spaces = probe.observation_space, probe.action_space
+    probe.close()
+    tasks = functools.partial(training_tasks, config)
+    env = TaskVecEnv(tasks, _ROBOTS, workers, seed, spaces, recover=True)
+    try:
+        student, first, last = distil(low, response, config.commands, env, turns, seed)
+    finally:
+        env.close()
+    vx, vy, yaw_rate = response.error.tolist()
+    return student, {
+        "robots": robots, "turns": turns, "seed": seed, "walked": len(given),
+        "error_vx_m_s": vx, "error_vy_m_s": vy, "error_yaw_rate_rad_s": yaw_rate,
+        "action_difference_before": first, "action_difference_after": last,
+    }  # fmt: skip
+
+
+def _walk(low: Policy, job: tuple[int, int]) -> tuple[Array, Array]:
+    return measure(low, *job)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--low", type=Path, required=True, help="low level, with or without suffix")
+    parser.add_argument("--out", type=Path, required=True, help="where to write the copy, likewise")
+    parser.add_argument("--robots", type=int, default=4800, help="that walk to be measured (4800)")
+    parser.add_argument("--turns", type=int, default=60, help="of 60 control steps to learn (60)")
+    parser.add_argument("--workers", type=workers_flag, default="auto", metavar="N")
+    parser.add_argument("--seed", type=int, default=42)
+    args = parser.parse_args(arguments)
+    try:
+        for name, least in (("robots", 64), ("turns", 1), ("seed", 0)):
+            if getattr(args, name) < least:
+                raise ValueError(f"--{name} must be {least} or more, not {getattr(args, name)}")
+        low = load_low(args.low)[0]
+        workers = args.workers
+        if workers == "auto":
+            workers = auto_workers(_ROBOTS, usable_cores())
+        student, facts = calibrate(low, args.robots, args.turns, workers, args.seed)
+        policies.save_copy(args.out, low, student.tensors(), {**low.meta, "calibration": facts})
+    except ValueError as error:
+        print(f"tdgc.calibration: {error}", file=sys.stderr)
+        return 2
+    except (WorkerError, OSError) as error:
+        print(f"tdgc.calibration: {error}", file=sys.stderr)
+        return 1
+    print(
+        f"{facts['walked']:.0f} of {args.robots} robots walked; what a command leads to is known "
+        f"to {facts['error_vx_m_s']:.3f} and {facts['error_vy_m_s']:.3f} m/s and "
+        f"{facts['error_yaw_rate_rad_s']:.3f} rad/s; difference in actions "
+        f"{facts['action_difference_before']:.3f} before and "
+        f"{facts['action_difference_after']:.3f} after learning"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

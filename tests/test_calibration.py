@@ -1,0 +1,231 @@
+"""Responses are learned and inverted, and a copy of a policy learns to act on the result."""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from tdgc import calibration, policies
+from tdgc.calibration import ResponseModel, Student, corrected, distil, measure, training_tasks
+from tdgc.commands import INDEX, commands_of, observed_command
+from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
+from tdgc.gaits import GAITS, gait_embedding
+from tdgc.locomotion import ACTOR_LAYOUT, MIRRORS, action_mirror, mirror_map
+from tdgc.low_env import LowLevelTask
+from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
+from tdgc.robot import Array
+from tdgc.vec import TaskVecEnv
+
+RANGES = CommandRanges()
+HALF = np.array([1.0, 0.6, 1.0])  # of the velocity ranges
+CONFIG = LowLevelConfig(families=("rough", "stair"), physics=PhysicsConfig(substeps=4))
+
+
+def commands(n: int, width: float = 1.0) -> Array:
+    """Over the full ranges, velocities over ``width`` times theirs, gaits in turn."""
+    rng = np.random.default_rng(0)
+    bounds = np.array(dataclasses.astuple(RANGES))
+    command = rng.uniform(bounds[:, 0], bounds[:, 1], (n, 12))
+    command[:, :3] *= width
+    return np.concatenate([command, gait_embedding(np.arange(n) % 4)], axis=1)
+
+
+def save_low(path: Path) -> Policy:
+    """A small symmetric policy whose actions depend on everything it sees."""
+    parts = (*mirror_map(ACTOR_LAYOUT, MIRRORS), *action_mirror())
+    size, limit = sum(n for _, n in ACTOR_LAYOUT), CONFIG.robot.action_limit
+    probe = LowLevelTask(CONFIG, 1, seed=0)
+    width = probe.obs_dim
+    full = (*probe.observation_mirror, *action_mirror())
+    probe.close()
+    assert all((a == b[: len(a)]).all() for a, b in zip(parts, full, strict=True))
+    th.manual_seed(0)
+    policy = AsymmetricActorCriticPolicy(
+        spaces.Box(-np.inf, np.inf, (width,), np.float32),
+        spaces.Box(-limit, limit, (12,), np.float32), lambda _: 1e-3, actor_dim=size,
+        mirror=Mirror(*(tuple(part.tolist()) for part in full)), net_arch=[32],
+    )  # fmt: skip
+    with th.no_grad():
+        for parameter in policy.parameters():
+            parameter += 0.1 * th.randn_like(parameter)
+    policies.save(path, policy, {"config": to_dict(CONFIG), "steps": 7})
+    return policies.load(path)
+
+
+@pytest.fixture(scope="module")
+def low(tmp_path_factory: pytest.TempPathFactory) -> Policy:
+    return save_low(tmp_path_factory.mktemp("calibration") / "low")
+
+
+# ------------------------------------------------------------------ responses
+
+
+def test_what_is_seen_of_commands_can_be_read_back() -> None:
+    command = commands(8)
+    np.testing.assert_allclose(commands_of(observed_command(command)), command, atol=1e-12)
+
+
+def test_corrected_commands_lead_where_they_should() -> None:
+    """v = 0.8 c + 0.1: (0.8 + p) c = (1 + p) v - 0.1, with the pull p = 0.1."""
+    command = commands(40, width=0.6)
+
+    def response(given: Array) -> Array:
+        return 0.8 * given[:, :3] + 0.1
+
+    given = corrected(response, command, RANGES)
+    np.testing.assert_allclose(given[:, :3], (1.1 * command[:, :3] - 0.1) / 0.9, atol=1e-6)
+    assert (given[:, 3:] == command[:, 3:]).all()
+
+
+def test_what_cannot_be_reached_is_not_asked_for_without_end() -> None:
+    """A robot that stays at half a metre a second: corrected commands end at 1.2 of the ranges,
+    and where more leads to less the pull holds them at what was asked, and less."""
+    command = commands(4)
+    command[:, :3] = [[1.0, 0.6, 1.0], [0.4, 0.0, 0.0], [-1.0, 0.0, -1.0], [0.0, 0.0, 0.0]]
+    given = corrected(lambda c: np.clip(0.5 * c[:, :3], -0.5, 0.5), command, RANGES)
+    assert given[0, :3].tolist() == pytest.approx((1.2 * HALF).tolist(), abs=1e-9)
+    assert given[1, 0] == pytest.approx(1.1 * 0.4 / 0.6, abs=5e-5)
+    assert given[2, [0, 2]].tolist() == [-1.2, -1.2]
+    assert given[3, :3].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_response_is_learned_for_each_gait() -> None:
+    """Undershoot by gait, drift with swing height, a turn with vy, and its mirror image."""
+    given = commands(1600, width=1.4)
+    gain = np.array([0.9, 0.6, 0.8, 0.7])[np.arange(1600) % 4]
+    reached = gain[:, None] * given[:, :3]
+    reached[:, 0] -= given[:, INDEX["swing_height"]]
+    reached[:, 2] += 0.5 * given[:, 1]
+    rng = np.random.default_rng(1)
+    model = ResponseModel(given, reached + rng.normal(0.0, 0.01, reached.shape), RANGES, seed=0)
+    assert (model.error < [0.05, 0.03, 0.05]).all() and (model.error > 0.005).all()
+    wanted = commands(40, width=0.7)
+    errors = []
+    for asked in (wanted[:, :3], corrected(model, wanted, RANGES)[:, :3]):
+        made = np.array([0.9, 0.6, 0.8, 0.7] * 10)[:, None] * asked
+        made[:, 0] -= wanted[:, INDEX["swing_height"]]
+        made[:, 2] += 0.5 * asked[:, 1]
+        errors.append(np.sqrt(np.mean((made - wanted[:, :3]) ** 2, axis=0)))
+    assert (errors[0] > 0.06).all()
+    assert (errors[1] < 0.35 * errors[0]).all()  # the pull leaves a tenth and more
+    again = ResponseModel(given[:80], reached[:80], RANGES, seed=3)
+    same = ResponseModel(given[:80], reached[:80], RANGES, seed=3)
+    assert (again(wanted) == same(wanted)).all()
+
+
+def test_a_range_of_one_point_is_no_division_by_zero() -> None:
+    ranges = dataclasses.replace(RANGES, frequency=(3.0, 3.0))
+    given = commands(64)
+    given[:, INDEX["frequency"]] = 3.0
+    model = ResponseModel(given, given[:, :3], ranges, seed=0)
+    assert np.isfinite(model(given)).all()
+
+
+def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None:
+    given, reached = measure(low, 8, seed=5)
+    assert len(given) == len(reached) <= 8 and reached.shape[1] == 3
+    assert (np.abs(given[:, :3]) <= 1.4 * HALF).all() and (np.abs(given[:, :3]) > HALF).any()
+    rows = {tuple(row) for row in given[:, 12:]}
+    assert rows <= {tuple(gait_embedding(g)) for g in range(len(GAITS))}
+    assert len(rows) >= 2
+    twice = measure(low, 8, seed=5)
+    assert (twice[0] == given).all() and (twice[1] == reached).all()
+
+
+# ------------------------------------------------------------------ the copy
+
+
+def test_a_student_begins_as_a_copy(low: Policy) -> None:
+    obs = np.random.default_rng(0).normal(size=(20, low.actor_dim)).astype(np.float32)
+    student = Student(low)
+    with th.inference_mode():
+        np.testing.assert_allclose(student(th.from_numpy(obs)), low.predict(obs)[0], atol=2e-6)
+    tensors = student.tensors()
+    assert set(tensors) == {name for name in low.tensors if name.startswith("actor.")}
+    assert all(th.equal(tensor, low.tensors[name]) for name, tensor in tensors.items())
+
+
+def test_robots_learn_on_a_plane_and_on_all_levels() -> None:
+    tasks = training_tasks(CONFIG, 30, seed=0)
+    assert [task.num_robots for task in tasks.tasks] == [18, 12]
+    assert tasks.tasks[0].tiles is None
+    assert tasks.tasks[1].level.tolist() == [*range(11), 0]
+    assert all((task.command_share == 1.0).all() for task in tasks.tasks)
+    tasks.close()
+
+
+def test_a_student_learns_what_is_done_at_corrected_commands(
+    low: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration, "_TURN", 8)
+    probe = LowLevelTask(CONFIG, 1, seed=0)
+    spaces_of = probe.observation_space, probe.action_space
+    probe.close()
+    tasks = functools.partial(training_tasks, CONFIG)
+    env = TaskVecEnv(tasks, 10, 1, 0, spaces_of)
+
+    def response(given: Array) -> Array:
+        return 0.5 * given[:, :3]
+
+    try:
+        student, first, last = distil(low, response, RANGES, env, turns=5, seed=0)
+    finally:
+        env.close()
+    assert last < 0.5 * first
+    assert any(not th.equal(t, low.tensors[name]) for name, t in student.tensors().items())
+
+
+def test_script(
+    low: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(calibration, "_TURN", 4)
+    monkeypatch.setattr(calibration, "_ROBOTS", 10)
+    monkeypatch.setattr(calibration, "_EPOCHS", 3)
+    policies.save_copy(tmp_path / "low", low, {}, low.meta)
+    arguments = ["--low", str(tmp_path / "low"), "--out", str(tmp_path / "out" / "copy")]
+    small = ["--robots", "64", "--turns", "1", "--workers", "1"]
+    assert calibration.main([*arguments, *small]) == 0
+    said = capsys.readouterr()
+    assert said.err == "" and said.out.count("\n") == 1
+    assert " of 64 robots walked; what a command leads to is known to " in said.out
+    copy = policies.load(tmp_path / "out" / "copy")
+    assert copy.meta["config"] == low.meta["config"] and copy.meta["steps"] == 7
+    assert copy.meta["calibration"]["seed"] == 42
+    changed = {n for n in low.tensors if not th.equal(low.tensors[n], copy.tensors[n])}
+    assert changed == {n for n in low.tensors if n.startswith("actor.")}
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--low", "{0}/none"], "none.json: no such file"),
+        (["--low", "{0}/low", "--robots", "63"], "--robots must be 64 or more, not 63"),
+        (["--low", "{0}/low", "--turns", "0"], "--turns must be 1 or more, not 0"),
+        (["--low", "tdgc/pretrained/high"], "high: not a low-level policy of this package"),
+    ],
+)
+def test_bad_input_is_one_line(
+    low: Policy,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    flags: list[str],
+    message: str,
+) -> None:
+    policies.save_copy(tmp_path / "low", low, {}, low.meta)
+    out = tmp_path / "out"
+    arguments = [flag.format(tmp_path) for flag in flags]
+    assert calibration.main([*arguments, "--out", str(out / "copy")]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("tdgc.calibration: ") and message in said.err
+    assert said.err.count("\n") == 1 and not out.exists()
+
+
+def test_a_copy_has_the_tensors_of_its_policy(low: Policy, tmp_path: Path) -> None:
+    for name, tensor in (("actor.9.bias", th.zeros(3)), ("actor.0.bias", th.zeros(3))):
+        with pytest.raises(ValueError, match=rf"^no tensor {name} of shape \(3,\) in this policy$"):
+            policies.save_copy(tmp_path / "copy", low, {name: tensor}, {})
+    assert not list(tmp_path.iterdir())
