@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 
 from tdgc import calibration, policies
-from tdgc.calibration import ResponseModel, Student, corrected, distil, measure, training_tasks
+from tdgc.calibration import Corrector, ResponseModel, Student, distil, measure, training_tasks
 from tdgc.commands import INDEX, commands_of, observed_command
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
 from tdgc.gaits import GAITS, gait_embedding
@@ -61,6 +61,12 @@ def low(tmp_path_factory: pytest.TempPathFactory) -> Policy:
     return save_low(tmp_path_factory.mktemp("calibration") / "low")
 
 
+@pytest.fixture(autouse=True)
+def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "_EPOCHS", 60)
+    monkeypatch.setattr(calibration, "_CORRECTIONS", 800)
+
+
 # ------------------------------------------------------------------ responses
 
 
@@ -69,31 +75,7 @@ def test_what_is_seen_of_commands_can_be_read_back() -> None:
     np.testing.assert_allclose(commands_of(observed_command(command)), command, atol=1e-12)
 
 
-def test_corrected_commands_lead_where_they_should() -> None:
-    """v = 0.8 c + 0.1: (0.8 + p) c = (1 + p) v - 0.1, with the pull p = 0.1."""
-    command = commands(40, width=0.6)
-
-    def response(given: Array) -> Array:
-        return 0.8 * given[:, :3] + 0.1
-
-    given = corrected(response, command, RANGES)
-    np.testing.assert_allclose(given[:, :3], (1.1 * command[:, :3] - 0.1) / 0.9, atol=1e-6)
-    assert (given[:, 3:] == command[:, 3:]).all()
-
-
-def test_what_cannot_be_reached_is_not_asked_for_without_end() -> None:
-    """A robot that stays at half a metre a second: corrected commands end at 1.2 of the ranges,
-    and where more leads to less the pull holds them at what was asked, and less."""
-    command = commands(4)
-    command[:, :3] = [[1.0, 0.6, 1.0], [0.4, 0.0, 0.0], [-1.0, 0.0, -1.0], [0.0, 0.0, 0.0]]
-    given = corrected(lambda c: np.clip(0.5 * c[:, :3], -0.5, 0.5), command, RANGES)
-    assert given[0, :3].tolist() == pytest.approx((1.2 * HALF).tolist(), abs=1e-9)
-    assert given[1, 0] == pytest.approx(1.1 * 0.4 / 0.6, abs=5e-5)
-    assert given[2, [0, 2]].tolist() == [-1.2, -1.2]
-    assert given[3, :3].tolist() == [0.0, 0.0, 0.0]
-
-
-def test_a_response_is_learned_for_each_gait() -> None:
+def test_a_response_is_learned_and_put_right_for_each_gait() -> None:
     """Undershoot by gait, drift with swing height, a turn with vy, and its mirror image."""
     given = commands(1600, width=1.4)
     gain = np.array([0.9, 0.6, 0.8, 0.7])[np.arange(1600) % 4]
@@ -103,18 +85,40 @@ def test_a_response_is_learned_for_each_gait() -> None:
     rng = np.random.default_rng(1)
     model = ResponseModel(given, reached + rng.normal(0.0, 0.01, reached.shape), RANGES, seed=0)
     assert (model.error < [0.05, 0.03, 0.05]).all() and (model.error > 0.005).all()
-    wanted = commands(40, width=0.7)
+    correct, wanted = Corrector(model, seed=0), commands(40, width=0.7)
+    assert (correct(wanted)[:, 3:] == wanted[:, 3:]).all()
     errors = []
-    for asked in (wanted[:, :3], corrected(model, wanted, RANGES)[:, :3]):
+    for asked in (wanted[:, :3], correct(wanted)[:, :3].copy()):
         made = np.array([0.9, 0.6, 0.8, 0.7] * 10)[:, None] * asked
         made[:, 0] -= wanted[:, INDEX["swing_height"]]
         made[:, 2] += 0.5 * asked[:, 1]
         errors.append(np.sqrt(np.mean((made - wanted[:, :3]) ** 2, axis=0)))
     assert (errors[0] > 0.06).all()
     assert (errors[1] < 0.35 * errors[0]).all()  # the pull leaves a tenth and more
-    again = ResponseModel(given[:80], reached[:80], RANGES, seed=3)
-    same = ResponseModel(given[:80], reached[:80], RANGES, seed=3)
-    assert (again(wanted) == same(wanted)).all()
+
+
+def test_what_cannot_be_reached_is_not_asked_for_without_end() -> None:
+    """A robot that stays at half of what it may be asked for: 1.2 of the ranges is the limit, but
+    for commands that are further out already."""
+    given = commands(800, width=1.4)
+    reached = np.clip(0.7 * given[:, :3], -0.5 * HALF, 0.5 * HALF)
+    model = ResponseModel(given, reached, RANGES, seed=0)
+    asked = commands(40)
+    corrected = Corrector(model, seed=0)(asked)
+    assert (np.abs(corrected[:, :3]) <= 1.2 * HALF + 1e-6).all()
+    assert np.abs(corrected[:, 0]).max() > 1.1
+    beyond = asked.copy()
+    beyond[:, 0] = 2.0
+    assert (Corrector(model, seed=0)(beyond)[:, 0] <= 2.0 + 1e-6).all()
+
+
+def test_the_same_seed_gives_the_same_networks() -> None:
+    given = commands(80)
+    made = [
+        Corrector(ResponseModel(given, 0.8 * given[:, :3], RANGES, seed), seed)(given)
+        for seed in (3, 3, 4)
+    ]
+    assert (made[0] == made[1]).all() and (made[0] != made[2]).any()
 
 
 def test_a_range_of_one_point_is_no_division_by_zero() -> None:
@@ -168,11 +172,11 @@ def test_a_student_learns_what_is_done_at_corrected_commands(
     tasks = functools.partial(training_tasks, CONFIG)
     env = TaskVecEnv(tasks, 10, 1, 0, spaces_of)
 
-    def response(given: Array) -> Array:
-        return 0.5 * given[:, :3]
+    def correct(command: Array) -> Array:
+        return np.concatenate([1.2 * command[:, :3], command[:, 3:]], axis=1)
 
     try:
-        student, first, last = distil(low, response, RANGES, env, turns=5, seed=0)
+        student, first, last = distil(low, correct, env, turns=5, seed=0)
     finally:
         env.close()
     assert last < 0.5 * first
@@ -185,6 +189,7 @@ def test_script(
     monkeypatch.setattr(calibration, "_TURN", 4)
     monkeypatch.setattr(calibration, "_ROBOTS", 10)
     monkeypatch.setattr(calibration, "_EPOCHS", 3)
+    monkeypatch.setattr(calibration, "_CORRECTIONS", 3)
     policies.save_copy(tmp_path / "low", low, {}, low.meta)
     arguments = ["--low", str(tmp_path / "low"), "--out", str(tmp_path / "out" / "copy")]
     small = ["--robots", "64", "--turns", "1", "--workers", "1"]
