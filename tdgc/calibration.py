@@ -77,7 +77,7 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     rng = np.random.default_rng((_STREAM, seed))
     gait = gait_embedding(np.arange(robots) % len(GAITS))
     command = np.concatenate([draw_commands(rng, config.commands, robots), gait], axis=1)
-    middle, _ = _velocity_ranges(config.commands)
+    middle = np.array([np.mean(getattr(config.commands, name)) for name in CONTINUOUS[:3]])
     command[:, :3] = middle + _MEASURED * (command[:, :3] - middle)
     settle = round(_SETTLE_SECONDS / config.physics.control_dt)
     up, total, steps = np.ones(robots, dtype=bool), np.zeros((robots, 3)), 0
@@ -91,14 +91,8 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     return command[up], total[up] / steps
 
 
-def _velocity_ranges(ranges: CommandRanges) -> tuple[Array, Array]:
-    """Middle and half of the width of the velocity ranges, (3,) each."""
-    low, high = np.array([getattr(ranges, name) for name in CONTINUOUS[:3]]).T
-    return 0.5 * (low + high), 0.5 * (high - low)
-
-
 def _network(seed: int) -> nn.Sequential:
-    """From commands as ``_scaled`` gives them to three shares of the velocity ranges."""
+    """From commands as ``ResponseModel.scaled`` gives them to three shares of the velocity ranges."""
     sizes = (NUM_COMMANDS, *_HIDDEN)
     with th.random.fork_rng():
         th.manual_seed(seed)
