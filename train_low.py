@@ -13,19 +13,17 @@ import dataclasses
 import functools
 import sys
 
-import numpy as np
 import torch as th
 from stable_baselines3 import PPO
 
 from tdgc import __version__, plots, policies
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, to_dict
-from tdgc.group import TaskGroup
-from tdgc.low_env import LowLevelTask, summarise
+from tdgc.low_env import LowLevelTask, make_task, summarise
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.tiles import check_families
 from tdgc.training import Phase, add_arguments, configure, run
 from tdgc.vec import TaskVecEnv
-from tdgc.worker import MakeLink, Task, WorkerError
+from tdgc.worker import MakeLink, WorkerError
 
 
 def phases(config: LowTrainConfig, device: str) -> list[Phase]:
@@ -44,22 +42,6 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
         Phase(functools.partial(build, config, others, device), min(until, config.steps))
         for others, until in (((plane, plane), config.plane_steps), ((plane, tiles), config.steps))
     ]
-
-
-def make_task(
-    config: tuple[LowLevelConfig, LowLevelConfig], share: float, robots: int, seed: int
-) -> Task:
-    """The robots of a worker: a share of them in the first MDP, the others in the second."""
-    first = round(share * robots)
-    if not first:
-        return LowLevelTask(config[1], robots, seed)
-    seeds = np.random.SeedSequence(seed).generate_state(2)
-    return TaskGroup(
-        [
-            LowLevelTask(mdp, number, int(own))
-            for mdp, number, own in zip(config, (first, robots - first), seeds, strict=True)
-        ]
-    )
 
 
 def build(

@@ -32,7 +32,7 @@ from tdgc.gaits import GAITS, gait_embedding
 from tdgc.group import TaskGroup
 from tdgc.high_env import load_low
 from tdgc.locomotion import ACTOR_LAYOUT, MIRRORS
-from tdgc.low_env import LowLevelTask, is_fallen
+from tdgc.low_env import LowLevelTask, is_fallen, make_task
 from tdgc.policies import ACTIVATIONS, Policy
 from tdgc.robot import Array
 from tdgc.vec import TaskVecEnv
@@ -92,7 +92,7 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
 
 
 def _network(seed: int) -> nn.Sequential:
-    """From commands as ``ResponseModel.scaled`` gives them to three shares of the velocity ranges."""
+    """From commands, scaled as ``ResponseModel.scaled`` does, to three scaled velocities."""
     sizes = (NUM_COMMANDS, *_HIDDEN)
     with th.random.fork_rng():
         th.manual_seed(seed)
@@ -208,15 +208,13 @@ class Corrector:
 def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> Task:
     """The training MDP as it is late in a run: all commands, all levels, most robots on a plane."""
     config = dataclasses.replace(config, command_start=1.0)
-    plane = round(_PLANE_SHARE * robots)
-    seeds = np.random.SeedSequence((_STREAM, seed)).generate_state(2)
-    on = [dataclasses.replace(config, terrain=terrain) for terrain in ("plane", "tiles")]
-    tasks = [
-        LowLevelTask(mdp, number, int(own))
-        for mdp, number, own in zip(on, (plane, robots - plane), seeds, strict=True)
-    ]
-    tasks[1].level[:] = np.arange(robots - plane) % config.levels
-    return TaskGroup(tasks)
+    plane, tiles = (dataclasses.replace(config, terrain=terrain) for terrain in ("plane", "tiles"))
+    group = make_task((plane, tiles), _PLANE_SHARE, robots, seed)
+    assert isinstance(group, TaskGroup)
+    rugged = group.tasks[1]
+    assert isinstance(rugged, LowLevelTask)
+    rugged.level[:] = np.arange(rugged.num_robots) % config.levels
+    return group
 
 
 class Student(nn.Module):

@@ -17,6 +17,7 @@ from tdgc import rewards
 from tdgc.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.config import LowLevelConfig
 from tdgc.gaits import GAITS, gait_embedding
+from tdgc.group import TaskGroup
 from tdgc.leaps import LANDING, straddling_frequency
 from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
 from tdgc.robot import NUM_JOINTS, Array, wrap_angle
@@ -30,6 +31,7 @@ from tdgc.terrain import (
     trench_centres,
 )
 from tdgc.tiles import FLAT, TrainingTiles
+from tdgc.worker import Task
 from tdgc.world import World
 
 FALL_HEIGHT = 0.15  # m, trunk above the support surface (paper Sec. IV-C)
@@ -601,6 +603,25 @@ class LowLevelTask:
     def close(self) -> None:
         """Disconnect from Bullet."""
         self.locomotion.world.close()
+
+
+def make_task(
+    config: tuple[LowLevelConfig, LowLevelConfig],
+    share: float,
+    robots: int,
+    seed: int,
+) -> Task:
+    """The robots of a worker: a share of them in the first MDP, the others in the second."""
+    first = round(share * robots)
+    if not first:
+        return LowLevelTask(config[1], robots, seed)
+    seeds = np.random.SeedSequence(seed).generate_state(2)
+    return TaskGroup(
+        [
+            LowLevelTask(mdp, number, int(own))
+            for mdp, number, own in zip(config, (first, robots - first), seeds, strict=True)
+        ]
+    )
 
 
 class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):

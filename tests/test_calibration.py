@@ -104,15 +104,18 @@ def test_what_cannot_be_reached_is_not_asked_for_without_end() -> None:
     reached = np.clip(0.7 * given[:, :3], -0.5 * HALF, 0.5 * HALF)
     model = ResponseModel(given, reached, RANGES, seed=0)
     asked = commands(40)
-    corrected = Corrector(model, seed=0)(asked)
+    correct = Corrector(model, seed=0)
+    corrected = correct(asked)
     assert (np.abs(corrected[:, :3]) <= 1.2 * HALF + 1e-6).all()
     assert np.abs(corrected[:, 0]).max() > 1.1
     beyond = asked.copy()
     beyond[:, 0] = 2.0
-    assert (Corrector(model, seed=0)(beyond)[:, 0] <= 2.0 + 1e-6).all()
+    assert (correct(beyond)[:, 0] <= 2.0 + 1e-6).all()
 
 
-def test_the_same_seed_gives_the_same_networks() -> None:
+def test_the_same_seed_gives_the_same_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "_EPOCHS", 5)
+    monkeypatch.setattr(calibration, "_CORRECTIONS", 20)
     given = commands(80)
     made = [
         Corrector(ResponseModel(given, 0.8 * given[:, :3], RANGES, seed), seed)(given)

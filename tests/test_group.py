@@ -8,7 +8,7 @@ import pytest
 import train_low
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, PhysicsConfig
 from tdgc.group import TaskGroup
-from tdgc.low_env import LowLevelTask, summarise
+from tdgc.low_env import LowLevelTask, make_task, summarise
 
 PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4), episode_seconds=0.4)
 TILES = dataclasses.replace(PLANE, terrain="tiles", families=("stair", "rough"))
@@ -97,14 +97,14 @@ def test_a_share_of_each_workers_robots_stays_on_the_plane() -> None:
     first, second = (phase.build.args[1] for phase in train_low.phases(config, "cpu"))
     assert [mdp.terrain for mdp in (*first, *second)] == ["plane", "plane", "plane", "tiles"]
     assert [mdp.physics.substeps for mdp in second] == [4, 8]
-    task = train_low.make_task(second, 0.6, 5, seed=0)
+    task = make_task(second, 0.6, 5, seed=0)
     assert isinstance(task, TaskGroup)
     assert [part.num_robots for part in task.tasks] == [3, 2]
     assert [part.field is None for part in task.tasks] == [True, False]
     draws = [part.rng.uniform() for part in task.tasks]
     task.close()
     assert draws[0] != draws[1]
-    alone = train_low.make_task(second, 0.0, 2, seed=0)
+    alone = make_task(second, 0.0, 2, seed=0)
     assert isinstance(alone, LowLevelTask) and alone.field is not None
     alone.close()
 

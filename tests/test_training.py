@@ -25,7 +25,7 @@ from stable_baselines3 import PPO
 import train_high
 import train_low
 from tdgc import policies
-from tdgc.config import LowTrainConfig, PPOConfig, from_dict, with_overrides
+from tdgc.config import LowTrainConfig, PPOConfig, from_dict, to_dict, with_overrides
 from tdgc.cores import usable_cores
 from tdgc.low_env import LowLevelTask
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
@@ -515,7 +515,7 @@ def test_flags_and_folders_that_cannot_be_used(
 ) -> None:
     used, empty = tmp_path / "used", tmp_path / "empty"
     used.mkdir()
-    (used / "config.json").write_text("{}", encoding="utf-8")
+    (used / "config.json").write_text(json.dumps(to_dict(LowTrainConfig())), encoding="utf-8")
     damaged = tmp_path / "damaged"
     shutil.copytree(used, damaged)
     (damaged / "config.json").write_text('{"seed": ', encoding="utf-8")
@@ -566,7 +566,8 @@ def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert workers() == workers("--set", "workers=2") == 2
     assert workers("--workers", "auto") == 3
     assert workers("--workers", "auto", "--n-envs", "25") == 2
-    (tmp_path / "config.json").write_text('{"workers": 7}', encoding="utf-8")
+    begun = json.dumps(to_dict(LowTrainConfig(workers=7)))
+    (tmp_path / "config.json").write_text(begun, encoding="utf-8")
     assert workers("--resume", "--workers", "auto") == workers("--resume") == 7
     assert workers("--resume", "--workers", "5") == 5
 
