@@ -28,7 +28,7 @@ from tdgc.commands import CONTINUOUS, NUM_COMMANDS, commands_of, observed_comman
 from tdgc.config import CommandRanges, LowLevelConfig
 from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.evaluation import draw_commands, spread, walk_on_plane
-from tdgc.gaits import GAITS, gait_embedding
+from tdgc.gaits import GAITS
 from tdgc.group import TaskGroup
 from tdgc.high_env import load_low
 from tdgc.locomotion import ACTOR_LAYOUT, MIRRORS
@@ -61,7 +61,9 @@ _UPDATES, _STATES = 120, 1024  # minibatches a turn, and their size
 _RATE = 3e-4  # of Adam, falling to nothing
 
 _SIGN = np.array(MIRRORS["command"][1])
-_FIRST = sum(dict(ACTOR_LAYOUT[:5]).values())  # column of the first command in an observation
+_NAMES = [name for name, _ in ACTOR_LAYOUT]
+# Column of the first command in an observation.
+_FIRST = sum(width for _, width in ACTOR_LAYOUT[: _NAMES.index("command")])
 _COMMAND = slice(_FIRST, _FIRST + NUM_COMMANDS)
 
 
@@ -75,8 +77,7 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     """
     config = load_low(low)[1]
     rng = np.random.default_rng((_STREAM, seed))
-    gait = gait_embedding(np.arange(robots) % len(GAITS))
-    command = np.concatenate([draw_commands(rng, config.commands, robots), gait], axis=1)
+    command = draw_commands(rng, config.commands, np.arange(robots) % len(GAITS))
     middle = np.array([np.mean(getattr(config.commands, name)) for name in CONTINUOUS[:3]])
     command[:, :3] = middle + _MEASURED * (command[:, :3] - middle)
     settle = round(_SETTLE_SECONDS / config.physics.control_dt)
@@ -173,9 +174,8 @@ class Corrector:
         optimiser = th.optim.Adam(self._network.parameters(), lr=2e-3)
         rate = th.optim.lr_scheduler.CosineAnnealingLR(optimiser, _CORRECTIONS)
         for _ in range(_CORRECTIONS):
-            gait = gait_embedding(rng.integers(0, len(GAITS), _STATES))
-            drawn = draw_commands(rng, response.ranges, _STATES)
-            asked = response.scaled(np.concatenate([drawn, gait], axis=1))
+            gait = rng.integers(0, len(GAITS), _STATES)
+            asked = response.scaled(draw_commands(rng, response.ranges, gait))
             given = self._correct(asked)
             expected = response.predictions(given)
             miss = expected.mean(dim=0) - asked[:, :3]

@@ -436,10 +436,13 @@ _SWITCH_SECONDS = 2.0  # between gaits in the falls test
 _FALL_SHARE, _FALL_SECONDS = 0.6, 20.0  # of the episodes: 100 a gait make 20 minutes of walking
 
 
-def draw_commands(rng: np.random.Generator, ranges: CommandRanges, n: int) -> Array:
-    """The 12 continuous commands of ``n`` robots, over the full ranges, (n, 12)."""
+def draw_commands(
+    rng: np.random.Generator, ranges: CommandRanges, gait: NDArray[np.integer]
+) -> Array:
+    """Commands of robots in these gaits (n,), the others over the full ranges, (n, 15)."""
     bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
-    return np.asarray(rng.uniform(bounds[:, 0], bounds[:, 1], (n, len(CONTINUOUS))))
+    continuous = rng.uniform(bounds[:, 0], bounds[:, 1], (len(gait), len(CONTINUOUS)))
+    return np.concatenate([continuous, gait_embedding(gait)], axis=1)
 
 
 def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Locomotion]:
@@ -470,10 +473,7 @@ def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, fl
     """
     config, g = low_config(low), GAITS.index(gait)
     rng = np.random.default_rng((EVAL_STREAM, seed, g))
-    command = np.concatenate(
-        [draw_commands(rng, config.commands, episodes), np.tile(gait_embedding(g), (episodes, 1))],
-        axis=1,
-    )
+    command = draw_commands(rng, config.commands, np.full(episodes, g))
     settle = round(_SETTLE_SECONDS / config.physics.control_dt)
     lin = yaw = match = count = 0.0
     for step, loco in enumerate(walk_on_plane(low, episodes, _TRACKING_SECONDS, seed)):
@@ -501,8 +501,7 @@ def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
     m, dt = robots, config.physics.control_dt
     rng = np.random.default_rng((EVAL_STREAM, seed, len(GAITS)))
     switch = round(_SWITCH_SECONDS / dt)
-    command = np.zeros((m, 15))
-    command[:, :12] = draw_commands(rng, config.commands, m)
+    command = draw_commands(rng, config.commands, np.zeros(m, dtype=np.int64))
     up = np.ones(m, dtype=bool)
     minutes = 0.0
     for step, loco in enumerate(walk_on_plane(low, m, _FALL_SECONDS, seed)):
