@@ -12,6 +12,7 @@ command what the policy does at the command that leads there. What goes in and o
 from __future__ import annotations
 
 import argparse
+import copy
 import dataclasses
 import functools
 import itertools
@@ -33,7 +34,7 @@ from tdgc.group import TaskGroup
 from tdgc.high_env import load_low
 from tdgc.locomotion import ACTOR_LAYOUT, MIRRORS
 from tdgc.low_env import LowLevelTask, is_fallen, make_task
-from tdgc.policies import ACTIVATIONS, Policy
+from tdgc.policies import Actor, Policy
 from tdgc.robot import Array
 from tdgc.vec import TaskVecEnv
 from tdgc.worker import Task, WorkerError
@@ -217,38 +218,6 @@ def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> Task:
     return group
 
 
-class Student(nn.Module):
-    """The actor of a low level, to be trained: observations (n, actor_dim) -> actions (n, 12)."""
-
-    def __init__(self, low: Policy) -> None:
-        super().__init__()
-        header = low.header
-        sizes = (low.actor_dim, *header.actor, low.action_dim)
-        self.layers = nn.ModuleList(nn.Linear(*pair) for pair in itertools.pairwise(sizes))
-        self.activation = ACTIVATIONS[header.activation]()
-        for i, layer in enumerate(self.layers):
-            layer.load_state_dict({k: low.tensors[f"actor.{i}.{k}"] for k in ("weight", "bias")})
-        self.mirror = None
-        if header.mirror is not None:
-            self.mirror = [th.tensor(part) for part in dataclasses.astuple(header.mirror)]
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        if self.mirror is None:
-            return self._act(x)
-        obs_index, obs_sign, action_index, action_sign = self.mirror
-        turned = self._act(x[:, obs_index] * obs_sign)
-        return 0.5 * (self._act(x) + turned[:, action_index] * action_sign)
-
-    def _act(self, x: th.Tensor) -> th.Tensor:
-        for layer in self.layers[:-1]:
-            x = self.activation(layer(x))
-        return th.as_tensor(self.layers[-1](x))
-
-    def tensors(self) -> dict[str, th.Tensor]:
-        """Its weights by their names in a policy's file."""
-        return {f"actor.{name[7:]}": tensor for name, tensor in self.state_dict().items()}
-
-
 @policies.one_thread()
 def distil(
     low: Policy,
@@ -256,7 +225,7 @@ def distil(
     env: TaskVecEnv,
     turns: int,
     seed: int,
-) -> tuple[Student, float, float]:
+) -> tuple[Actor, float, float]:
     """A student, a copy at first, that learns to do what ``low`` does at corrected commands.
 
     It acts and learns from the states that it comes to (DAgger, Ross et al. 2011).
@@ -265,7 +234,8 @@ def distil(
         The student, and the root mean square of its difference in actions: on the states of its
         first turn before it has learned anything, and on those of its last.
     """
-    student, rng = Student(low), np.random.default_rng((_STREAM, seed))
+    student = copy.deepcopy(low.actor).requires_grad_(True)
+    rng = np.random.default_rng((_STREAM, seed))
     optimiser = th.optim.Adam(student.parameters(), lr=_RATE)
     seen: list[tuple[th.Tensor, th.Tensor]] = []
     first = last = 0.0
@@ -302,7 +272,7 @@ def distil(
 
 def calibrate(
     low: Policy, robots: int, turns: int, workers: int, seed: int
-) -> tuple[Student, dict[str, float]]:
+) -> tuple[Actor, dict[str, float]]:
     """Measure, fit and distil: the student, and what is to be known of it (keys say the unit).
 
     Raises:

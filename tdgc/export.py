@@ -30,7 +30,6 @@ from typing import Any
 
 import numpy as np
 import torch as th
-import torch.nn.functional as F
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
@@ -128,26 +127,17 @@ _BODY = (
 _GYRO = Signal("gyro", 3, "rad/s", "angular velocity about the trunk's axes: ahead, left, up")
 
 
-class Actor(nn.Module):
-    """The mean action of a policy as ``Policy.predict`` computes it, after the LSTM if any."""
+class ClippedActor(nn.Module):
+    """The mean action of a policy as ``Policy.predict`` clips it, after the LSTM if any."""
 
     def __init__(self, policy: Policy) -> None:
         super().__init__()
-        self.layers, self.activation = policy._layers, policy._activation
-        self.mirror = policy._mirror
+        self.actor = policy.actor
         self.low, self.high = th.from_numpy(policy.low), th.from_numpy(policy.high)
 
     def forward(self, x: Tensor) -> Tensor:
         """(n,) -> (action_dim,), both float32."""
-        if self.mirror is not None:
-            obs_index, obs_sign, action_index, action_sign = self.mirror
-            x = th.stack([x, x[obs_index] * obs_sign])
-        for weight, bias in self.layers[:-1]:
-            x = self.activation(F.linear(x, weight, bias))
-        x = F.linear(x, *self.layers[-1])
-        if self.mirror is not None:
-            x = 0.5 * (x[0] + x[1, action_index] * action_sign)
-        return x.clamp(self.low, self.high)
+        return th.as_tensor(self.actor(x[None])[0]).clamp(self.low, self.high)
 
 
 def foot_phases(clock: Tensor, command: Tensor) -> Tensor:
@@ -214,7 +204,7 @@ class LowLevel(nn.Module):
 
     def __init__(self, policy: Policy, config: LowLevelConfig) -> None:
         super().__init__()
-        self.actor = Actor(policy)
+        self.actor = ClippedActor(policy)
         robot = config.robot
         self.dt = _constant(config.physics.control_dt)
         self.limit = _constant(robot.action_limit)
@@ -298,7 +288,7 @@ class HighLevel(nn.Module):
 
     def __init__(self, policy: Policy, config: HighLevelConfig, low: LowLevelConfig) -> None:
         super().__init__()
-        self.actor = Actor(policy)
+        self.actor = ClippedActor(policy)
         self.lstm = policy._lstm
         hidden = self.lstm[1].shape[1]
         decoder = CommandDecoder(config.commands, config.action_limit)

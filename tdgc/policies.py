@@ -718,6 +718,42 @@ def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
 # The loaded side
 
 
+class Actor(nn.Module):
+    """The mean action, before it is clipped, after the LSTM if any: (n, inputs) -> (n, actions).
+
+    With a mirror it is exactly symmetric, as with ``MirroredHead``.
+    """
+
+    def __init__(self, header: Header, tensors: Mapping[str, th.Tensor]) -> None:
+        super().__init__()
+        self.activation = _FUNCTIONS[header.activation]
+        self.layers = nn.ModuleList()
+        for i in range(len(header.actor) + 1):
+            weight, bias = tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]
+            layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
+            layer.load_state_dict({"weight": weight, "bias": bias}, assign=True)
+            self.layers.append(layer.requires_grad_(False))
+        self.mirror: tuple[th.Tensor, ...] | None = None
+        if header.mirror is not None:
+            self.mirror = tuple(th.tensor(part) for part in dataclasses.astuple(header.mirror))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        if self.mirror is not None:
+            obs_index, obs_sign, action_index, action_sign = self.mirror
+            x = th.cat([x, x[:, obs_index] * obs_sign])
+        for layer in self.layers[:-1]:
+            x = self.activation(layer(x))
+        x = self.layers[-1](x)
+        if self.mirror is not None:
+            seen, mirrored = x.chunk(2)
+            x = 0.5 * (seen + mirrored[:, action_index] * action_sign)
+        return x
+
+    def tensors(self) -> dict[str, th.Tensor]:
+        """Its weights by their names in a policy's file."""
+        return {f"actor.{name[7:]}": tensor for name, tensor in self.state_dict().items()}
+
+
 class Policy:
     """A loaded policy: acts as SB3's does, without SB3.
 
@@ -730,6 +766,7 @@ class Policy:
         action_dim: number of actions.
         low, high: bounds of the actions, (action_dim,), in the environment's action units.
         tensors: all weights by the name in the file, the critic's too.
+        actor: what of them acts, the LSTM apart.
     """
 
     def __init__(self, header: Header, tensors: dict[str, th.Tensor]) -> None:
@@ -743,19 +780,12 @@ class Policy:
         self.high: Array = np.array(header.high, dtype=np.float32)
         self.tensors = tensors
         self._hidden = header.lstm
-        self._activation = _FUNCTIONS[header.activation]
-        self._layers = [
-            (tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"])
-            for i in range(len(header.actor) + 1)
-        ]
+        self.actor = Actor(header, tensors)
         self._lstm = [tensors[f"actor_lstm.{t}"] for t in _LSTM_TENSORS] if header.lstm else []
         log_std = tensors["log_std"].numpy()
         if header.mirror is not None:
             log_std = 0.5 * (log_std + log_std[list(header.mirror.action_index)])
         self._std: Array = np.exp(log_std)
-        self._mirror: tuple[th.Tensor, ...] | None = None
-        if header.mirror is not None:
-            self._mirror = tuple(th.tensor(part) for part in dataclasses.astuple(header.mirror))
         self.seed(0)
 
     def seed(self, seed: int | None) -> None:
@@ -799,16 +829,7 @@ class Policy:
                 h, c = self._previous(state, episode_start, len(batch), self._hidden)
                 h, c = th.lstm_cell(latent, (h, c), *self._lstm)
                 latent, state = h, (h.numpy()[None], c.numpy()[None])
-            if self._mirror is not None:
-                obs_index, obs_sign, action_index, action_sign = self._mirror
-                latent = th.cat([latent, latent[:, obs_index] * obs_sign])
-            for weight, bias in self._layers[:-1]:
-                latent = self._activation(F.linear(latent, weight, bias))
-            output = F.linear(latent, *self._layers[-1])
-            if self._mirror is not None:
-                seen, mirrored = output.chunk(2)
-                output = 0.5 * (seen + mirrored[:, action_index] * action_sign)
-            actions: Array = output.numpy()
+            actions: Array = self.actor(latent).numpy()
         if not deterministic:
             noise = self._rng.standard_normal(actions.shape, dtype=np.float32)
             actions = actions + self._std * noise

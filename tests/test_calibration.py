@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 
 from tdgc import calibration, policies
-from tdgc.calibration import Corrector, ResponseModel, Student, distil, measure, training_tasks
+from tdgc.calibration import Corrector, ResponseModel, distil, measure, training_tasks
 from tdgc.commands import INDEX, commands_of, observed_command
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
 from tdgc.gaits import GAITS, gait_embedding
@@ -144,16 +144,6 @@ def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None
 
 
 # ------------------------------------------------------------------ the copy
-
-
-def test_a_student_begins_as_a_copy(low: Policy) -> None:
-    obs = np.random.default_rng(0).normal(size=(20, low.actor_dim)).astype(np.float32)
-    student = Student(low)
-    with th.inference_mode():
-        np.testing.assert_allclose(student(th.from_numpy(obs)), low.predict(obs)[0], atol=2e-6)
-    tensors = student.tensors()
-    assert set(tensors) == {name for name in low.tensors if name.startswith("actor.")}
-    assert all(th.equal(tensor, low.tensors[name]) for name, tensor in tensors.items())
 
 
 def test_robots_learn_on_a_plane_and_on_all_levels() -> None:
