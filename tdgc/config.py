@@ -54,6 +54,11 @@ class RobotConfig:
     # Gait cycles after a start or a change of gait over which q0's swing grows to what is asked:
     # of 21 falls in walking with random changes of gait 19 came within 0.7 s of one.
     swing_ramp: float = 1.0
+    # Hz and gait cycles: a gait begins no slower than this, and is as slow as asked after so many.
+    # Falls in 10 minutes with a random gait every 2 s: 2.6 without, 1.4, 1.0 and 0.8 with 3.0, 3.2
+    # and 3.5 Hz over 2 cycles, 1.6 with 3.0 Hz over one (docs/experiments.md).
+    start_frequency: float = 3.5
+    start_cycles: float = 2.0
 
 
 @dataclass(frozen=True)

@@ -212,6 +212,11 @@ class LowLevel(nn.Module):
         self.whole = _constant(1.0)
         ramped = robot.commanded_pose and robot.swing_ramp > 0.0
         self.ramp = _constant(robot.swing_ramp) if ramped else None
+        hurried = robot.start_frequency > 0.0 and robot.start_cycles > 0.0
+        self.start = _constant(robot.start_cycles) if hurried else None
+        self.least = _constant(robot.start_frequency)
+        self.counted = ramped or hurried
+        self.is_frequency = _constant(np.arange(NUM_COMMANDS) == INDEX["frequency"])
         # These maps are affine, so their values at 0 and at 1 say all.
         ones = np.full((1, NUM_JOINTS), robot.action_limit)
         self.joint_scale = _constant(joint_targets(robot, 0.0 * ones, ones)[0] / robot.action_limit)
@@ -227,7 +232,7 @@ class LowLevel(nn.Module):
             Signal("commands", NUM_COMMANDS, None, "to follow in this step", "commands"),
             Signal("clock", 1, "1", "share of the gait cycle, in [0, 1)", None, "next_clock", 0.0),
         ]
-        if self.ramp is not None:
+        if self.counted:
             first = tuple(default_command().tolist())
             form = (NUM_COMMANDS, None, "the last", "commands", "commands", first)
             self.inputs += [
@@ -239,7 +244,7 @@ class LowLevel(nn.Module):
             Signal("joint_targets", NUM_JOINTS, "rad", "for the joint control", "joints"),
             Signal("next_clock", 1, "1", "share of the gait cycle at the end of this step"),
         ]
-        if self.ramp is not None:
+        if self.counted:
             self.outputs.append(
                 Signal("next_cycles", 1, "1", "of the gait so far, after this step")
             )
@@ -249,10 +254,15 @@ class LowLevel(nn.Module):
         x = _by_name(self.inputs, values)
         command, clock = x["commands"], x["clock"]
         grown = self.whole
-        if self.ramp is not None:
+        if self.counted:
             same = (command[12:] == x["last_commands"][12:]).all()
             cycles = x["cycles"] * same
+        if self.ramp is not None:
             grown = (cycles / self.ramp).clamp(max=1.0)
+        if self.start is not None:
+            early = 1.0 - (cycles / self.start).clamp(max=1.0)
+            missing = (self.least - command[INDEX["frequency"]]).clamp(min=0.0)
+            command = command + self.is_frequency * (early * missing)
         pose = self.pose(clock, grown, command)
         parts = [
             x["gravity"],
@@ -270,7 +280,7 @@ class LowLevel(nn.Module):
         run = self.dt * command[INDEX["frequency"]]
         clock = clock + run
         step = (action, pose + self.joint_scale * action, clock - clock.floor())
-        return step if self.ramp is None else (*step, cycles + run)
+        return (*step, cycles + run) if self.counted else step
 
     def _gait(self, command: Tensor) -> Tensor:
         """Index of the gait as a share of the last one's, as the observation has it: (1,)."""

@@ -144,8 +144,11 @@ class PhaseClock:
         """phi_t: sin(2 pi phase) of each foot, (M, 4), as the low level sees it."""
         return np.sin(2.0 * np.pi * self.phases)
 
+    def begun(self, cycles: float) -> NDArray[np.float64]:
+        """Share that is over of a gait's first ``cycles``, (M,) in [0, 1]; 1 if these are 0."""
+        return np.minimum(self.cycles / cycles, 1.0) if cycles > 0.0 else np.ones_like(self.cycles)
+
     def swing(self, ramp: float) -> NDArray[np.float64]:
         """Height of each foot as a share of its apex, (M, 4), which grows over the first ``ramp``
         cycles of a gait: legs that are all drawn up before the trunk rises let it drop."""
-        grown = np.minimum(self.cycles / ramp, 1.0) if ramp > 0.0 else np.ones_like(self.cycles)
-        return grown[:, None] * swing_profile(self.phases)
+        return self.begun(ramp)[:, None] * swing_profile(self.phases)

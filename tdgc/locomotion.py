@@ -30,6 +30,7 @@ from tdgc.world import World
 
 SPEED_SCALE = 0.05  # joint speed as the networks see it (Walk These Ways)
 GYRO_SCALE = 0.25  # angular velocity likewise
+_FREQUENCY = INDEX["frequency"]
 _HISTORY = 3  # control steps of targets kept: the step, and two before for latency up to 40 ms
 
 #: Names and sizes of the actor's observation in order: s^L of Sec. IV-A.
@@ -136,6 +137,15 @@ class Locomotion:
         """Profile of the swing, (M, 4): height of each foot as a share of the commanded apex."""
         return self.clock.swing(self.robot.swing_ramp)
 
+    def executed(self) -> Array:
+        """The commands as they are carried out now, (M, 15): a gait begins no slower than
+        ``start_frequency``. At 2 Hz pronk and bound fly for a quarter of a second, and a robot's
+        first jump is too weak for that."""
+        begun, asked = self.clock.begun(self.robot.start_cycles), self.command[:, _FREQUENCY]
+        command = self.command.copy()
+        command[:, _FREQUENCY] += (1.0 - begun) * np.maximum(self.robot.start_frequency - asked, 0)
+        return command
+
     def pose(self) -> Array:
         """q0, the pose that actions start from and joint errors refer to, (M, 12) rad."""
         if not self.robot.commanded_pose:
@@ -209,7 +219,7 @@ class Locomotion:
         self.world.step(self.targets, self.delay, self.joint_offset)
         self.clock.advance(
             self.physics.control_dt,
-            self.command[:, INDEX["frequency"]],
+            self.executed()[:, _FREQUENCY],
             self.command[:, 12:],
             self.command[:, INDEX["duration"]],
         )
@@ -279,7 +289,7 @@ class Locomotion:
             SPEED_SCALE * speed,
             self.actions[0],
             self.actions[1],
-            observed_command(self.command),
+            observed_command(self.executed()),
             self.clock.signal(),
             gait_index(self.command)[:, None] / (len(GAITS) - 1),
         ]

@@ -330,7 +330,7 @@ class LowLevelTask:
         base_height, foot_height, _ = self._ground
         return rewards.LowStep(
             state=loco.world.state,
-            command=loco.command,
+            command=loco.executed(),
             phases=loco.clock.phases,
             contact=loco.clock.contact,
             swing=loco.swing(),

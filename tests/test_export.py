@@ -150,9 +150,19 @@ def one_thread() -> Iterator[None]:
 # --- the graphs' mathematics --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("gyro", "symmetric"), [(False, True), (True, False)])
-def test_low_level_is_the_executors_step(tmp_path: Path, gyro: bool, symmetric: bool) -> None:
-    robot = RobotConfig(action_limit=0.6, hip_scale=0.4, nominal_hip=0.07, commanded_pose=symmetric)
+@pytest.mark.parametrize(
+    ("gyro", "symmetric", "start"), [(False, True, 3.5), (True, False, 3.5), (True, False, 0.0)]
+)
+def test_low_level_is_the_executors_step(
+    tmp_path: Path, gyro: bool, symmetric: bool, start: float
+) -> None:
+    robot = RobotConfig(
+        action_limit=0.6,
+        hip_scale=0.4,
+        nominal_hip=0.07,
+        commanded_pose=symmetric,
+        start_frequency=start,
+    )
     config = LowLevelConfig(gyro=gyro, robot=robot)
     policy = random_low(tmp_path / "low", config, symmetric)
     level = LowLevel(policy, config)
@@ -162,7 +172,7 @@ def test_low_level_is_the_executors_step(tmp_path: Path, gyro: bool, symmetric: 
         disturb(loco, rng)
         before = loco.command.copy()
         loco.clock.update(before[:, 12:], before[:, 5])
-        cycles = rng.uniform(0.1, 2.0, m)  # swing grows over the first
+        cycles = rng.uniform(0.1, 3.0, m)  # swing grows over the first, two are hurried
         loco.clock.cycles = cycles.copy()
         loco.command[:6] = random_commands(rng, 7)[1:]  # other gaits than before
         loco.actions = rng.uniform(-0.6, 0.6, (2, m, 12))
@@ -178,8 +188,9 @@ def test_low_level_is_the_executors_step(tmp_path: Path, gyro: bool, symmetric: 
             assert got["action"] == pytest.approx(loco.actions[0, k], abs=3e-6)
             assert got["joint_targets"] == pytest.approx(loco.targets[0, k], abs=1e-6)
             assert got["next_clock"] == pytest.approx(loco.clock.clock[k], abs=1e-15)
-            assert ("next_cycles" in got) == symmetric  # a fixed pose does not swing
-            if symmetric:
+            counted = symmetric or start > 0.0  # a fixed pose does not swing
+            assert ("next_cycles" in got) == counted
+            if counted:
                 assert got["next_cycles"] == pytest.approx(loco.clock.cycles[k], abs=1e-12)
                 assert (k < 6) == (got["next_cycles"][0] < 0.081)
         at_limit = np.abs(loco.actions[0]) == 0.6
@@ -297,15 +308,15 @@ def test_check_finds_other_weights(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_clock_does_not_drift(folder: Path, form: str) -> None:
-    """1000 steps at 3.1 Hz: a step of 0.02 s rounded to float32 would be 3e-8 off by then."""
+    """1000 steps at 3.7 Hz: a step of 0.02 s rounded to float32 would be 3e-8 off by then."""
     graph = Graph(folder, "low", form)
     command = np.concatenate([np.full(12, 0.5), GAIT_TABLE[2]])
-    command[4] = 3.1
+    command[4] = 3.7
     rest = {name: np.zeros(size) for name, size in
             (("gravity", 3), ("joint_angles", 12), ("joint_speeds", 12), ("gyro", 3))}  # fmt: skip
     for _ in range(1000):
         graph(rest | {"commands": command})
-    assert graph.memory["clock"][0] == pytest.approx(np.mod(1000 * 0.02 * 3.1, 1.0), abs=1e-11)
+    assert graph.memory["clock"][0] == pytest.approx(np.mod(1000 * 0.02 * 3.7, 1.0), abs=1e-11)
 
 
 def test_graph_hands_on_what_the_interface_says(folder: Path) -> None:
