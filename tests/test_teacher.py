@@ -7,7 +7,7 @@ import pytest
 
 from tdgc.commands import INDEX, CommandDecoder, gait_index
 from tdgc.config import PhysicsConfig, RobotConfig
-from tdgc.leaps import straddling_frequency
+from tdgc.leaps import STANCE_LENGTH, STRIDE, straddling_frequency
 from tdgc.locomotion import Locomotion
 from tdgc.teacher import STYLES, Teacher, travel_cost, trenches
 from tdgc.terrain import TileField, make_tile, trench_centres
@@ -115,7 +115,7 @@ def test_leaps_are_timed_before_trenches_and_end_behind_them(course) -> None:
     command = course.commands()
     one = np.ones(1)
     expected = straddling_frequency(
-        1.7 * one, 1.1 * one, 0 * one, 0.37 * one, 0.33 * one, trench_centres(0.8)[None]
+        1.7 * one, 1.1 * one, 0 * one, STRIDE * one, STANCE_LENGTH * one, trench_centres(0.8)[None]
     )
     assert 2.0 < expected[0] < 4.0
     assert command[0, INDEX["frequency"]] == pytest.approx(expected[0])
