@@ -56,7 +56,7 @@ class GoToGoal:
     (docs/experiments.md).
     """
 
-    top_speed: float = 0.5  # m/s
+    top_speed: float = 0.6  # m/s
     distance_gain: float = 1.0  # 1/s
     heading_gain: float = 1.5  # 1/s
     swing_height: float = 0.2  # m
