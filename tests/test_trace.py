@@ -228,16 +228,16 @@ def test_the_baseline_has_no_actions_and_no_cues(low):
 
 
 def test_robots_that_end_early_have_short_traces(low):
-    """Two robots without thigh motors fall while the third goes on; each has its own time."""
+    """Two robots whose motors are dead fall while the third goes on; each has its own time."""
 
     class Limp(BaselineDriver):
         def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
             super().begin(loco, goal, family)
             loco.world.strength = np.ones((3, 12))
-            loco.world.strength[0, [1, 4, 7, 10]] = loco.world.strength[1, [1, 4]] = 0.0
+            loco.world.strength[:2] = 0.0
 
     _, traces, episodes = watch(Limp(), Cell("gp", "nominal", "rough", 0, 0, 3), low[0])
-    assert [e.outcome for e in episodes].count("timeout") < 3
+    assert [e.outcome for e in episodes] == ["fell", "fell", "timeout"]
     for t, e in zip(traces, episodes, strict=True):
         steps = round(e.time_s / 0.02)
         assert t.outcome == e.outcome
