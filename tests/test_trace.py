@@ -233,7 +233,6 @@ def test_robots_that_end_early_have_short_traces(low):
     class Limp(BaselineDriver):
         def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
             super().begin(loco, goal, family)
-            loco.world.strength = np.ones((3, 12))
             loco.world.strength[:2] = 0.0
 
     _, traces, episodes = watch(Limp(), Cell("gp", "nominal", "rough", 0, 0, 3), low[0])
