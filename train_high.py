@@ -23,7 +23,7 @@ from tdgc.commands import INDEX, CommandDecoder, default_command
 from tdgc.config import PRESETS, ConfigError, HighTrainConfig, to_dict
 from tdgc.high_env import NavigationTask, check_pair, load_low, summarise
 from tdgc.imitation import Apprentice, ApprenticePolicy
-from tdgc.leaps import LANDING, measure_landing
+from tdgc.leaps import measure_landing
 from tdgc.policies import Policy
 from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.teacher import check_styles
@@ -62,9 +62,9 @@ def build(
         env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
     probe = NavigationTask(env_config, low, 1, seed=0, guided=guided)
     spaces = probe.observation_space, probe.action_space
-    landing = LANDING
+    landing = None
     if guided and "gap" in env_config.families:
-        landing = measure_landing(low, probe.low_config, env_config.decimation)
+        landing = measure_landing(low, probe.low_config)
     probe.close()
     env = TaskVecEnv(
         functools.partial(NavigationTask, env_config, low, guided=guided, landing=landing),

@@ -23,21 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.evaluation import Episode, EpisodeRecord, tile_of
-from tdgc.robot import Array
 from tdgc.terrain import (
     GOAL_BEGIN,
-    HALF_ZONES,
     MAX_LEVEL,
     PILLAR_HEIGHT,
     START_END,
     TILE_SIZE,
-    TREAD,
-    TRENCH_SPACING,
-    WHOLE_ZONE,
     ZONE,
-    Section,
     Tile,
-    difficulty_parameter,
 )
 from tdgc.trace import TRACKED, Trace
 
@@ -261,29 +254,18 @@ def place_of(x: float) -> str:
 def features(tile: Tile, x: float, y: float) -> Iterator[tuple[str, float]]:
     """The nearest trench, step and pillar of those that the tile has, each with its distance in m
     from (x, y) m in the tile's frame; numbered along the way."""
-    sections = HALF_ZONES if len(tile.parts) > 1 else (WHOLE_ZONE,)
-    for part, section in zip(tile.parts, sections, strict=True):
-        if part == "gap":
-            width = difficulty_parameter(part, tile.difficulty)
-            away = np.maximum(np.abs(x - _trenches(section)) - 0.5 * width, 0.0)
-            yield f"trench {away.argmin() + 1} of {away.size}", float(away.min())
-        elif part == "stair":
-            away = np.abs(x - _risers(section))
-            yield f"step {away.argmin() + 1} of {away.size}", float(away.min())
-        elif part == "pillar":
-            distance, px, py = _to_pillar(tile, x, y)
-            yield f"pillar at ({px:.1f}, {py:.1f}) m", distance
-
-
-def _trenches(section: Section) -> Array:
-    count = round((section.end - section.begin) / TRENCH_SPACING)
-    return np.asarray(section.begin + TRENCH_SPACING * (np.arange(count) + 0.5), dtype=np.float64)
-
-
-def _risers(section: Section) -> Array:
-    half = int((section.end - section.begin) / 2 / TREAD)
-    up = section.begin + TREAD * np.arange(half)
-    return np.concatenate([up, section.end - TREAD * np.arange(half)[::-1]])
+    found = tile.features
+    if len(found.trenches):
+        away = np.maximum(np.maximum(found.trenches[:, 0] - x, x - found.trenches[:, 1]), 0.0)
+        yield f"trench {away.argmin() + 1} of {away.size}", float(away.min())
+    if len(found.risers):
+        away = np.abs(x - found.risers[:, 0])
+        yield f"step {away.argmin() + 1} of {away.size}", float(away.min())
+    if len(found.pillars):
+        px, py, diameter = found.pillars.T
+        distance = np.maximum(np.hypot(px - x, py - y) - 0.5 * diameter, 0.0)
+        k = distance.argmin()
+        yield f"pillar at ({px[k]:.1f}, {py[k]:.1f}) m", float(distance[k])
 
 
 def _to_pillar(tile: Tile, x: float, y: float) -> tuple[float, float, float]:

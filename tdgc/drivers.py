@@ -102,7 +102,7 @@ class TeacherDriver:
 
     def __init__(self, low: Policy, config: LowLevelConfig) -> None:
         self.config = HighLevelConfig(cues="none")
-        self._landing = measure_landing(low, config, self.config.decimation)
+        self._landing = measure_landing(low, config)
         self.bounds = CommandRanges()
         self.action: NDArray[np.floating] | None = None
 

@@ -158,7 +158,8 @@ def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
     physics = config.physics
     if condition.physics_hz is not None:
         substeps = round(physics.control_dt * condition.physics_hz)
-        physics = dataclasses.replace(physics, substeps=substeps)
+        # One torque per physics step, as a motor driver at that rate has it.
+        physics = dataclasses.replace(physics, substeps=substeps, hold=1)
     return physics
 
 
@@ -231,7 +232,7 @@ def run_cell(
     loco.friction[:], loco.payload[:] = friction, condition.payload
     world.strength[:] = condition.motor
     loco.delay[:] = condition.latency
-    world.set_dynamics(rows, loco.friction, loco.payload)
+    loco.apply_dynamics(rows)
     loco.place(rows, start[:, :2] + origin, start[:, 2], np.zeros(m))
     driver.begin(loco, goal, cell.family)
     if watcher is not None:

@@ -69,9 +69,11 @@ from tdgc.robot import (
     HIGHEST_FOOT,
     NUM_JOINTS,
     Array,
+    action_scale,
     foot_kinematics,
     joint_targets,
     nominal_pose,
+    target_limits,
 )
 
 #: Formats and the endings of their files.
@@ -217,9 +219,10 @@ class LowLevel(nn.Module):
         self.least = _constant(robot.start_frequency)
         self.counted = ramped or hurried
         self.is_frequency = _constant(np.arange(NUM_COMMANDS) == INDEX["frequency"])
-        # These maps are affine, so their values at 0 and at 1 say all.
-        ones = np.full((1, NUM_JOINTS), robot.action_limit)
-        self.joint_scale = _constant(joint_targets(robot, 0.0 * ones, ones)[0] / robot.action_limit)
+        self.joint_scale = _constant(action_scale(robot))
+        lowest, highest = target_limits(robot, read_geometry(robot))
+        self.lowest, self.highest = _constant(lowest), _constant(highest)
+        # This map is affine, so its values at 0 and at 1 say all.
         zero = observed_command(np.zeros(NUM_COMMANDS))
         self.command_zero = _constant(zero)
         self.command_gain = _constant(observed_command(np.ones(NUM_COMMANDS)) - zero)
@@ -279,7 +282,8 @@ class LowLevel(nn.Module):
         action = self.actor(th.cat(parts).float()).double().clamp(-self.limit, self.limit)
         run = self.dt * command[INDEX["frequency"]]
         clock = clock + run
-        step = (action, pose + self.joint_scale * action, clock - clock.floor())
+        targets = (pose + self.joint_scale * action).clamp(self.lowest, self.highest)
+        step = (action, targets, clock - clock.floor())
         return (*step, cycles + run) if self.counted else step
 
     def _gait(self, command: Tensor) -> Tensor:
@@ -640,7 +644,8 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
             task.elapsed += 1
             for k in range(config.decimation):
                 action = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
-                targets = joint_targets(loco.robot, loco.pose(), action.astype(np.float64))
+                geometry, wanted = loco.world.state.geometry, action.astype(np.float64)
+                targets = joint_targets(loco.robot, geometry, loco.pose(), wanted)
                 step = walk(_sense(task) | {"commands": made["commands"]})
                 seconds.append(walk.seconds + (decide.seconds if k == 0 else 0.0))
                 differences += [step["action"] - action[0], step["joint_targets"] - targets[0]]

@@ -25,7 +25,7 @@ from tdgc.config import (
 )
 from tdgc.curriculum import Curriculum
 from tdgc.gaits import GAITS
-from tdgc.leaps import LANDING, Landing
+from tdgc.leaps import Landing
 from tdgc.locomotion import SPEED_SCALE, Locomotion
 from tdgc.low_env import GOAL_RADIUS, TaskEnv, is_fallen
 from tdgc.policies import Policy
@@ -220,7 +220,7 @@ class NavigationTask:
         training: bool = True,
         visual: bool = False,
         guided: int = 0,
-        landing: Landing = LANDING,
+        landing: Landing | None = None,
     ) -> None:
         self.config, self._visual = config, visual
         self.num_robots = m = num_robots

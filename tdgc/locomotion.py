@@ -96,7 +96,8 @@ class Locomotion:
         command: (M, 15), to be set by the caller.
         actions: (2, M, 12), the last clipped action and the one before.
         targets: (3, M, 12) rad, joint targets of the last step and the two before.
-        delay: (M,) s of latency; joint_offset: (M, 12) rad; friction, payload: (M,).
+        delay: (M,) s of latency; joint_offset: (M, 12) rad; friction, payload: (M,); armature:
+            (M,) kg m^2.
     """
 
     def __init__(
@@ -122,6 +123,7 @@ class Locomotion:
         self.joint_offset = np.zeros((num_robots, NUM_JOINTS))
         self.friction = np.full(num_robots, physics.friction)
         self.payload = np.zeros(num_robots)
+        self.armature = np.zeros(num_robots)
         geometry = self.world.state.geometry
         # Feet in the nominal pose, (1, 4, 3) m, and how high the trunk is above their soles.
         self._feet, _ = foot_kinematics(geometry, self.nominal[None], np.zeros((1, NUM_JOINTS)))
@@ -198,7 +200,15 @@ class Locomotion:
         self.world.strength[index, 0] = draw(config.motor_strength, 1.0)
         self.joint_offset[index] = draw(config.joint_offset, 0.0, (n, NUM_JOINTS))
         self.delay[index] = draw(config.latency, 0.0)
-        self.world.set_dynamics(index, self.friction[index], self.payload[index])
+        self.armature[index] = draw(config.armature, 0.0)
+        self.world.joint_friction[index, 0] = draw(config.joint_friction, 0.0)
+        self.apply_dynamics(index)
+
+    def apply_dynamics(self, index: NDArray[np.integer]) -> None:
+        """Bring friction, payload and armature of the robots ``index`` into Bullet."""
+        self.world.set_dynamics(
+            index, self.friction[index], self.payload[index], self.armature[index]
+        )
 
     def act(self, actions: NDArray[np.floating]) -> None:
         """One control step: clip, scale, delay, PD control in Bullet, clock (Sec. IV-A).
@@ -214,7 +224,8 @@ class Locomotion:
         limit = self.robot.action_limit
         clipped = np.clip(np.asarray(actions, dtype=np.float64), -limit, limit)
         self.actions = np.stack([clipped, self.actions[0]])
-        targets = joint_targets(self.robot, self.pose(), clipped)
+        geometry = self.world.state.geometry
+        targets = joint_targets(self.robot, geometry, self.pose(), clipped)
         self.targets = np.concatenate([targets[None], self.targets[:-1]])
         self.world.step(self.targets, self.delay, self.joint_offset)
         self.clock.advance(
@@ -239,7 +250,9 @@ class Locomotion:
             "joint_offset": self.joint_offset,
             "friction": self.friction,
             "payload": self.payload,
+            "armature": self.armature,
             "strength": self.world.strength,
+            "joint_friction": self.world.joint_friction,
             **{name: getattr(self.world.state, name) for name in measured},
         }
 
@@ -253,12 +266,10 @@ class Locomotion:
         Raises:
             ValueError: a state of other robots.
         """
-        # States from before gaits were counted are of robots whose swing had no ramp.
-        uncounted = {"cycles": np.zeros(self.num_robots), "gait": self.clock.embedding}
-        fill(self._arrays(), uncounted | state)
+        fill(self._arrays(), state)
         self.world.state.derive()
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
-        self.world.set_dynamics(np.arange(self.num_robots), self.friction, self.payload)
+        self.apply_dynamics(np.arange(self.num_robots))
         self.world.forget()
 
     def observe(
@@ -275,6 +286,7 @@ class Locomotion:
         gravity = state.gravity
         error = state.q - self.joint_offset - self.pose()
         speed = state.qd
+        gyro = np.einsum("mji,mj->mi", state.rotation, state.ang_vel)
         if noise is not None and rng is not None:
 
             def jitter(like: Array, width: float) -> Array:
@@ -283,6 +295,7 @@ class Locomotion:
             gravity = gravity + jitter(gravity, noise.noise_gravity)
             error = error + jitter(error, noise.noise_joint_angle)
             speed = speed + jitter(speed, noise.noise_joint_speed)
+            gyro = gyro + jitter(gyro, noise.noise_gyro)
         parts = [
             gravity,
             error,
@@ -294,5 +307,5 @@ class Locomotion:
             gait_index(self.command)[:, None] / (len(GAITS) - 1),
         ]
         if self.gyro:
-            parts.append(GYRO_SCALE * np.einsum("mji,mj->mi", state.rotation, state.ang_vel))
+            parts.append(GYRO_SCALE * gyro)
         return np.concatenate(parts, axis=1).astype(np.float32)

@@ -18,7 +18,7 @@ from tdgc.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.config import LowLevelConfig
 from tdgc.gaits import GAITS, gait_embedding
 from tdgc.group import TaskGroup
-from tdgc.leaps import LANDING, straddling_frequency
+from tdgc.leaps import SPEED, SWING_HEIGHT, Landing, LeapPlan
 from tdgc.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
 from tdgc.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.state import State, copies, fill
@@ -28,7 +28,6 @@ from tdgc.terrain import (
     TRENCH_DEPTH,
     Tile,
     draw_start_goal,
-    trench_centres,
 )
 from tdgc.tiles import FLAT, TrainingTiles
 from tdgc.worker import Task
@@ -49,7 +48,7 @@ CRITIC_LAYOUT = (
     ("foot_height", 4),
     ("foot_contact", 4),
     ("desired_contact", 4),
-    ("dynamics", 4),
+    ("dynamics", 6),
     ("terrain", len(_PROBES)),
 )
 _CRITIC_MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
@@ -59,7 +58,7 @@ _CRITIC_MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
     "foot_height": ((1, 0, 3, 2), (1.0,) * 4),
     "foot_contact": ((1, 0, 3, 2), (1.0,) * 4),
     "desired_contact": ((1, 0, 3, 2), (1.0,) * 4),
-    "dynamics": ((0, 1, 2, 3), (1.0,) * 4),
+    "dynamics": ((0, 1, 2, 3, 4, 5), (1.0,) * 6),
     "terrain": (_PROBE_SWAP, (1.0,) * len(_PROBES)),
 }
 
@@ -71,25 +70,25 @@ _CROSSING_SPEED = (0.25, 0.8)  # m/s
 # What a crossing leaves of the ranges: a foot that must clear a 13 cm step, or a trunk that bends
 # away from a 0.4 rad slope, cannot follow the rest and learns nothing from it. With feet below 9 cm
 # a third crossed level 0 of Gap where all did above 16 cm.
-_CLEARANCE = (0.05, 0.13)  # m, added to the least swing height at difficulty 0 and 1
+_CLEARANCE = (0.05, 0.15)  # m, added to the least swing height at difficulty 0 and 1
 _BEND = 0.3  # share of the pitch and roll ranges at difficulty 1
+# On stairs of 15 cm a level trunk's middle passes over an edge as low as a fall; nose up it climbs.
+# So pitch follows a share of the slope under the robot, the share drawn with the commands.
+_SLOPE_POINTS = _PROBES[:, 0]
 _HEADING_GAIN = 1.0  # 1/s, yaw rate asked per rad of heading error
 
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
 
 # Of the commands drawn, in the order of GAITS. Free: trot is what crossings are mostly made in.
 # Crossing: trot climbs best, and with all gaits alike the worst one decides how far levels rise.
-_FREE_GAITS = (0.1, 0.2, 0.3, 0.4)
+_FREE_GAITS = (0.2, 0.2, 0.3, 0.3)
 _CROSSING_GAITS = (0.8, 0.05, 0.075, 0.075)
-# Over trenches most crossings leap: pronk with a stride of about the stance length puts front and
-# rear feet on the same lines, and a trench fits between two of them if the steps are timed, which
-# the crossing does and the decision level has to learn. Other gaits fall into the first trench, and
-# with half of the crossings in them levels stayed below 2.
+# Over trenches most crossings leap, their landings planned (``tdgc.leaps``). Other gaits fall into
+# the first trench, and with half of the crossings in them levels stayed below 2.
 _TRENCH_GAITS = (0.15, 0.85, 0.0, 0.0)
-_LEAP_SPEED = (0.9, 1.0)  # m/s
-_LEAP_SWING = 0.07  # m at most: four legs drawn up at once drop the trunk
-_STRIDE = (0.35, 0.39)  # m; the robot is slow to start with longer ones
-_CENTRES = np.array([trench_centres(level / MAX_LEVEL) for level in range(MAX_LEVEL + 1)])
+_LEAP_SPEED = (0.9 * SPEED, SPEED)  # m/s
+_DECISION = 5  # control steps between two decisions on a leap: as the high policy's
+_LANDING_RATE = 0.002  # of a landing in what is known of them: the last 500 count
 # Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet land
 # on the same lines, so that a trench fits between two of them. Drawn evenly, such commands are too
 # rare: of 0.86 m/s at 2 Hz the robot did 0.5. As shares of the ranges: 0.7-1 m/s at 2-2.75 Hz.
@@ -178,7 +177,12 @@ class LowLevelTask:
         self._next_push = np.zeros(m, dtype=np.int64)
         self._crossing = np.zeros(m, dtype=bool)
         self._speed = np.zeros(m)
-        self._stride = np.zeros(m)  # m, of crossings that leap, else 0
+        self._leaping = np.zeros(m, dtype=bool)  # of crossings
+        self._follow = np.zeros(m)  # share of the slope ahead that pitch follows in a crossing
+        self._pitch = np.zeros(m)  # rad, what is added to it
+        self._plan = LeapPlan(m, config.commands)
+        self._landing = Landing()
+        self._look(np.arange(m))
         self._facing = np.zeros(m)
         self._waypoint = np.zeros((m, 2))
         self._reached = np.zeros(m, dtype=bool)
@@ -214,6 +218,7 @@ class LowLevelTask:
             changed = self.tiles.begin(index, self.level)
             if changed.size:
                 self.locomotion.world.upload_terrain(changed)
+                self._look(changed)
             self._origin[index] = self.tiles.field.origin(index, np.zeros_like(index))
             start, goal = draw_start_goal(rng, (n,))
             # Free commands lead anywhere, so those robots of a flat tile start in its middle.
@@ -242,6 +247,7 @@ class LowLevelTask:
         self.locomotion.world.close()
         if self.tiles is not None:
             self.tiles.draw(np.arange(self.num_robots), self.level)
+            self._look(np.arange(self.num_robots))
         self.locomotion = self._build_locomotion()
         self._gait_scores[:] = 0.0
         self.reset(np.arange(self.num_robots))
@@ -255,13 +261,14 @@ class LowLevelTask:
     ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """One control step of all robots: (M, 12) -> reward, terminated, truncated, (M,) each."""
         loco, c = self.locomotion, self.config
-        before = loco.world.state.qd.copy()
+        before, clock = loco.world.state.qd.copy(), loco.clock.clock.copy()
         loco.act(np.asarray(actions, dtype=np.float64))
         self.elapsed += 1
+        leaping = np.flatnonzero(self._leaping)
+        self._landing.learn(loco, leaping, clock[leaping], _LANDING_RATE)
         self._ground = self._measure_ground()
         terms = rewards.low_terms(self._low_step(before), c.rewards)
-        penalty = np.where(self._rugged, c.rewards.terrain_penalty, 1.0)
-        reward = rewards.total(terms, c.rewards, c.physics.control_dt, penalty)
+        reward = rewards.total(terms, c.rewards, c.physics.control_dt, self._penalty())
         terminated = is_fallen(loco.world)
         truncated = (self.elapsed >= self.horizon) | self._left_tile() | self._reached
         truncated &= ~terminated
@@ -270,6 +277,16 @@ class LowLevelTask:
         self._update_curriculum(terminated | truncated, terminated)
         self._refresh()
         return reward, terminated, truncated
+
+    def _penalty(self) -> Array:
+        """Share of the penalties that counts for each robot, (M,): it falls as the commands of its
+        gait grow, and is least on terrain."""
+        c = self.config
+        start = min(c.command_start, 1.0 - 1e-6)  # a task whose commands are whole from the start
+        grown = (self.command_share - start) / (1.0 - start)
+        share = 1.0 + (c.rewards.walking_penalty - 1.0) * grown
+        mine = share[gait_index(self.locomotion.command)]
+        return np.where(self._rugged, c.rewards.terrain_penalty, mine)
 
     def observe(self) -> NDArray[np.float32]:
         """(M, obs_dim): the actor's part, noisy in training, and the critic's."""
@@ -286,6 +303,8 @@ class LowLevelTask:
             loco.payload / 3.0,
             5.0 * (loco.world.strength[:, 0] - 1.0),
             loco.delay / 0.03,
+            100.0 * loco.armature,
+            5.0 * loco.world.joint_friction[:, 0],
         ]
         return np.concatenate(
             [
@@ -371,12 +390,11 @@ class LowLevelTask:
         values[rng.uniform(size=n) < 0.1, :3] = 0.0
         leaps = crossing & trenches & (gait == GAITS.index("pronk"))
         swing = INDEX["swing_height"]
-        values[leaps, swing] = rng.uniform(self._low[swing], _LEAP_SWING, int(leaps.sum()))
-        stride, length = rng.uniform(*_STRIDE, n), INDEX["stance_length"]
-        closest = np.clip(stride - LANDING.spread, self._low[length], self._high[length])
-        values[leaps, length] = closest[leaps]
+        values[leaps, swing] = rng.uniform(self._low[swing], SWING_HEIGHT, int(leaps.sum()))
         command[index] = np.concatenate([values, gait_embedding(gait)], axis=1)
-        self._stride[index] = np.where(leaps, stride, 0.0)
+        self._leaping[index] = leaps
+        self._follow[index] = np.where(leaps, 0.0, rng.uniform(size=n))
+        self._pitch[index] = values[:, INDEX["pitch"]]
         slow, fast = rng.uniform(*_CROSSING_SPEED, n), rng.uniform(*_LEAP_SPEED, n)
         self._speed[index] = np.where(leaps, fast, slow)
         free = rng.uniform(-np.pi, np.pi, n)
@@ -414,7 +432,9 @@ class LowLevelTask:
         offset = self._waypoint - state.position[:, :2]
         self._reached |= self._crossing & (np.linalg.norm(offset, axis=1) < GOAL_RADIUS)
         bearing = np.arctan2(offset[:, 1], offset[:, 0])
-        error = wrap_angle(bearing + self._facing - state.yaw)
+        # A leap faces across the trenches, so that both feet of a pair land on one line.
+        heading = np.where(self._leaping, 0.0, bearing + self._facing)
+        error = wrap_angle(heading - state.yaw)
         direction = bearing - state.yaw
         velocity = self._speed[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
         over = np.abs(velocity) / self._high[:2]
@@ -423,19 +443,33 @@ class LowLevelTask:
         rows = np.flatnonzero(self._crossing)
         self.locomotion.command[rows, :2] = velocity[rows]
         self.locomotion.command[rows, 2] = turn[rows]
-        leaping = np.flatnonzero(self._crossing & (self._stride > 0.0))
+        j = INDEX["pitch"]
+        pitch = self._pitch - self._follow * self._slope_ahead()
+        self.locomotion.command[rows, j] = np.clip(pitch, self._low[j], self._high[j])[rows]
+        leaping = np.flatnonzero(self._leaping & (self.elapsed % _DECISION == 0))
         if leaping.size:
-            command = self.locomotion.command[leaping]
-            frequency = straddling_frequency(
+            frequency, length = self._plan.steps(
+                leaping,
                 (state.position[:, 0] - self._origin[:, 0])[leaping],
                 state.heading_vel[leaping, 0],
                 self.locomotion.clock.clock[leaping],
-                self._stride[leaping],
-                command[:, INDEX["stance_length"]],
-                _CENTRES[self.level[leaping]],
+                self._landing,
             )
-            j = INDEX["frequency"]
-            self.locomotion.command[leaping, j] = np.clip(frequency, self._low[j], self._high[j])
+            self.locomotion.command[leaping, INDEX["frequency"]] = frequency
+            self.locomotion.command[leaping, INDEX["stance_length"]] = length
+
+    def _slope_ahead(self) -> Array:
+        """Angle of the ground under the robots along their headings, uphill positive, (M,) rad."""
+        arm = _SLOPE_POINTS - _SLOPE_POINTS.mean()
+        return np.arctan(self._ground[2] @ arm / (arm @ arm))
+
+    def _look(self, index: NDArray[np.integer]) -> None:
+        """Plan the leaps of the robots ``index`` (n,) over the trenches of their tiles."""
+        if self.field is None:
+            return
+        for i in index[self._trenches[index]]:
+            trenches = self.field.features[int(i), 0].trenches
+            self._plan.look(int(i), trenches, self._landing.spread)
 
     def _schedule_push(self, index: NDArray[np.integer]) -> None:
         seconds = self.rng.uniform(*self.config.randomisation.push_interval, len(index))
@@ -539,6 +573,10 @@ class LowLevelTask:
         for g, name in enumerate(GAITS):
             stats[f"share/{name}"] = self.num_robots * float(self.command_share[g])
         stats["robots"] = float(self.num_robots)
+        if self._trenches.any():
+            stats["leapers"] = 1.0
+            stats["landing/front"] = self._landing.front
+            stats["landing/spread"] = self._landing.spread
         stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
         return stats
 
@@ -556,7 +594,9 @@ class LowLevelTask:
             "next_push": self._next_push,
             "crossing": self._crossing,
             "speed": self._speed,
-            "stride": self._stride,
+            "leaping": self._leaping,
+            "follow": self._follow,
+            "pitch": self._pitch,
             "facing": self._facing,
             "waypoint": self._waypoint,
             "reached": self._reached,
@@ -569,6 +609,7 @@ class LowLevelTask:
         """What was learned of the robots, and their ``episodes`` under way, as copies."""
         return {
             "rng": self.rng.bit_generator.state,
+            "landing": [self._landing.front, self._landing.spread],
             "tiles_drawn": 0 if self.tiles is None else self.tiles.drawn,
             **copies({"level": self.level, "command_share": self.command_share}),
             "episodes": {
@@ -586,6 +627,7 @@ class LowLevelTask:
             ValueError: a state of other robots.
         """
         self.rng.bit_generator.state = state["rng"]
+        self._landing = Landing(*state["landing"])
         fill({"level": self.level, "command_share": self.command_share}, state)
         if self.tiles is not None:
             self.tiles.drawn = int(state["tiles_drawn"])
@@ -596,6 +638,7 @@ class LowLevelTask:
         fill(self._arrays(), episodes)
         if self.tiles is not None:
             self.tiles.load_state_dict(episodes["tiles"])
+            self._look(np.arange(self.num_robots))
             self.locomotion.world.upload_terrain()
         self.locomotion.load_state_dict(episodes["locomotion"])
         self._ground = self._measure_ground()
@@ -692,6 +735,8 @@ def summarise(sums: dict[str, float]) -> dict[str, float]:
             values[f"reward/{key[5:]}"] = value / steps
         elif key.startswith("share/"):
             values[f"command_share/{key[6:]}"] = value / sums["robots"]
+        elif key.startswith("landing/"):
+            values[key] = value / sums["leapers"]
     for gait in GAITS:
         n = max(sums.get(f"gait/{gait}/steps", 0.0), 1.0)
         values[f"tracking/{gait}_velocity_rmse"] = (sums.get(f"gait/{gait}/lin", 0.0) / n) ** 0.5

@@ -236,7 +236,7 @@ LOW_TERMS: dict[str, Callable[[LowStep], Array]] = {
         power,
     )
 }
-_NO_TERMS = {"sigma_lin", "sigma_yaw", "terrain_penalty"}
+_NO_TERMS = {"sigma_lin", "sigma_yaw", "walking_penalty", "terrain_penalty"}
 if set(LOW_TERMS) != {f.name for f in dataclasses.fields(LowRewardConfig)} - _NO_TERMS:
     raise TypeError("LOW_TERMS and LowRewardConfig name different terms")
 

@@ -50,21 +50,46 @@ def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swin
     return leg_angles(geometry, feet)
 
 
-def joint_targets(config: RobotConfig, pose: Array, actions: Array) -> Array:
-    """q* = q0 + alpha clip(a, -a_max, a_max): (M, 12) twice -> (M, 12) rad (Sec. IV-A)."""
-    scale = config.action_scale * np.tile([config.hip_scale, 1.0, 1.0], 4)
+def action_scale(config: RobotConfig) -> Array:
+    """alpha of the paper, (12,) rad per unit action: hips move less than thighs and calves."""
+    return config.action_scale * np.tile([config.hip_scale, 1.0, 1.0], 4)
+
+
+def joint_targets(config: RobotConfig, geometry: Geometry, pose: Array, actions: Array) -> Array:
+    """q* = q0 + alpha clip(a, -a_max, a_max): (M, 12) twice -> (M, 12) rad (Sec. IV-A).
+
+    Targets keep ``joint_margin`` from the joint limits, as a motor driver would see to.
+    """
     clipped = np.clip(actions, -config.action_limit, config.action_limit)
-    return np.asarray(pose + scale * clipped)
+    return np.clip(pose + action_scale(config) * clipped, *target_limits(config, geometry))
 
 
-def pd_torque(error: Array, speed: Array, strength: Array, config: RobotConfig) -> Array:
-    """Joint torques of the PD law, limited as the motors are.
+def target_limits(config: RobotConfig, geometry: Geometry) -> tuple[Array, Array]:
+    """Lowest and highest joint targets, (12,) rad each; infinite where nothing limits them."""
+    if config.joint_margin is None:
+        return np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
+    low, high = geometry.joint_limits.T
+    return low + config.joint_margin, high - config.joint_margin
+
+
+FRICTION_SPEED = 1.0  # rad/s at which dry friction is whole: a step below it would chatter
+
+
+def pd_torque(
+    error: Array,
+    speed: Array,
+    strength: Array,
+    config: RobotConfig,
+    friction: Array | float = 0.0,
+) -> Array:
+    """Joint torques of the PD law, limited as the motors are, less what the joints' friction takes.
 
     Args:
         error: (M, 12) target minus angle, rad.
         speed: (M, 12) joint speed, rad/s.
         strength: (M, 1) motor strength, times gains and limits.
         config: gains and limits.
+        friction: (M, 1) N m, dry friction in each joint.
 
     Returns:
         (M, 12) N m. A joint at its speed limit gets no torque that would drive it faster.
@@ -76,6 +101,8 @@ def pd_torque(error: Array, speed: Array, strength: Array, config: RobotConfig) 
     fast = np.abs(speed) >= np.array(4 * config.speed_limit)
     if fast.any():
         torque[fast & (torque * speed > 0.0)] = 0.0
+    if np.any(friction):
+        torque -= friction * np.clip(speed / FRICTION_SPEED, -1.0, 1.0)
     return torque
 
 

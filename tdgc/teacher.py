@@ -17,31 +17,20 @@ from numpy.typing import NDArray
 
 from tdgc.commands import INDEX, default_command
 from tdgc.config import CommandRanges
-from tdgc.gaits import GAITS, gait_embedding
-from tdgc.leaps import (
-    LANDING,
-    SPEED,
-    STANCE_LENGTH,
-    STRIDE,
-    SWING_HEIGHT,
-    Landing,
-    straddling_frequency,
-)
+from tdgc.leaps import SPEED, Landing, LeapPlan, leap_command
 from tdgc.locomotion import Locomotion
 from tdgc.robot import Array, wrap_angle
-from tdgc.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TRENCH_DEPTH, TileField
+from tdgc.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
 
 
 @dataclass(frozen=True)
 class Style:
-    """How to walk: speed in m/s, frequency in Hz, swing height, stance width and length in m."""
+    """How to walk: speed in m/s, frequency in Hz, swing height and stance width in m."""
 
     speed: float
     frequency: float = 3.0
     swing_height: float = 0.08
     stance_width: float = 0.25
-    stance_length: float = 0.38
-    gait: str = "trot"
 
 
 #: A family's style. Numbers beside the defaults of Walk These Ways are from docs/experiments.md.
@@ -49,10 +38,11 @@ STYLES = {
     "rough": Style(0.6, swing_height=0.2, stance_width=0.32),
     "pillar": Style(0.5),
     "stair": Style(0.6, swing_height=0.2, stance_width=0.35),
-    "gap": Style(SPEED, swing_height=SWING_HEIGHT, stance_length=STANCE_LENGTH, gait="pronk"),
+    "gap": Style(SPEED),  # in pronk, see ``tdgc.leaps``
     "tilt": Style(0.6, frequency=3.5, swing_height=0.2),
 }
 _BEYOND = 0.5  # m behind the last trench, where leaping ends
+_LEAP_TURN = 1.5  # 1/s, yaw rate per rad that a leap is off its heading; as in ``toward``
 
 # The way around pillars follows a field of travel costs on every second sample of the tile.
 _COARSE = 2
@@ -84,45 +74,36 @@ def toward(
     return speed * np.maximum(np.cos(error), 0.0), turn
 
 
-def trenches(heights: NDArray[np.floating]) -> Array:
-    """Centres along x, (k,) m, of the trenches of one tile's heights (161, n) m."""
-    low = heights[:, heights.shape[1] // 2] < -0.5 * TRENCH_DEPTH
-    first = np.flatnonzero(low[1:] & ~low[:-1]) + 1
-    last = np.flatnonzero(low[:-1] & ~low[1:])
-    return np.asarray(0.5 * CELL * (first + last))
-
-
-def travel_cost(
-    heights: NDArray[np.floating], left: float, goal: Array
-) -> tuple[Array, float, float]:
-    """Cost of travelling to the goal from all over a tile, walls being what stands 0.5 m high.
+def travel_cost(pillars: Array, width: int, left: float, goal: Array) -> tuple[Array, float, float]:
+    """Cost of travelling to the goal from all over a tile, around its pillars.
 
     Args:
-        heights: (161, n) m.
-        left: m, y of the first column in the tile's frame.
+        pillars: (k, 3) m, x, y and diameter.
+        width: samples across the tile.
+        left: m, y of the first of them in the tile's frame.
         goal: (2,) m.
 
     Returns:
-        The field (81, n // 2 + 1), its step in m, and ``left``.
+        The field (81, width // 2 + 1), its step in m, and ``left``.
     """
-    coarse = heights[::_COARSE, ::_COARSE]
     step = _COARSE * CELL
-    x, y = np.arange(coarse.shape[0]) * step, left + np.arange(coarse.shape[1]) * step
-    away = np.full(coarse.shape, np.inf)
-    for i, j in zip(*np.nonzero(coarse > 0.5), strict=True):
-        np.minimum(away, np.hypot(x[:, None] - x[i], y[None] - y[j]), out=away)
+    x = np.arange(0, TILE_SAMPLES, _COARSE) * CELL
+    y = left + np.arange(0, width, _COARSE) * CELL
+    away = np.full((len(x), len(y)), np.inf)
+    for cx, cy, diameter in pillars:
+        distance = np.hypot(x[:, None] - cx, y - cy) - 0.5 * diameter
+        np.minimum(away, distance, out=away)
     near = np.clip((_WIDE - away) / (_WIDE - _RADIUS), 0.0, 1.0)
     price = np.where(away < _RADIUS, _BLOCKED, 1.0 + (_CLOSE - 1.0) * near)
-    cost = np.full((coarse.shape[0] + 2, coarse.shape[1] + 2), np.inf)  # a border around all
+    cost = np.full((len(x) + 2, len(y) + 2), np.inf)  # a border around all
     inside = np.s_[1:-1, 1:-1]
-    at = np.clip(np.round((goal - [0.0, left]) / step).astype(int), 0, np.array(coarse.shape) - 1)
+    at = np.clip(np.round((goal - [0.0, left]) / step).astype(int), 0, np.array(away.shape) - 1)
     cost[at[0] + 1, at[1] + 1] = 0.0
     shifts = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
     while True:
         before = cost[inside].copy()
         for a, b in shifts:
-            nx, ny = coarse.shape
-            neighbour = cost[1 + a : 1 + a + nx, 1 + b : 1 + b + ny]
+            neighbour = cost[1 + a : 1 + a + len(x), 1 + b : 1 + b + len(y)]
             np.minimum(cost[inside], neighbour + np.hypot(a, b) * step * price, out=cost[inside])
         if np.array_equal(before, cost[inside]):
             return cost[inside].copy(), step, left
@@ -155,37 +136,33 @@ class Teacher:
     """
 
     def __init__(
-        self, field: TileField, families: Sequence[str], landing: Landing = LANDING
+        self, field: TileField, families: Sequence[str], landing: Landing | None = None
     ) -> None:
         check_styles(families)
         m = len(families)
-        self._field, self._landing = field, landing
+        self._field, self._landing = field, landing or Landing()
         self._origin = field.origin(np.arange(m), 0)
         self._leaps = np.array([family == "gap" for family in families])
         self._pillars = np.array([family == "pillar" for family in families])
         styles = [STYLES[family] for family in families]
         self._command = np.tile(default_command(), (m, 1))
-        for name in ("frequency", "swing_height", "stance_width", "stance_length"):
+        for name in ("frequency", "swing_height", "stance_width"):
             self._command[:, INDEX[name]] = [getattr(style, name) for style in styles]
         self._speed = np.array([style.speed for style in styles])
-        self._gait = np.array([GAITS.index(style.gait) for style in styles])
-        self._centres = np.full((m, 1), -np.inf)
+        self._plan = LeapPlan(m, CommandRanges())
+        self._end = np.full(m, -np.inf)  # m, x where a robot has no more to leap over
         self._fields: dict[int, tuple[Array, float, float]] = {}
 
     def begin(self, index: NDArray[np.integer], goal: Array) -> None:
         """Look at the tiles of the robots ``index`` (n,); ``goal`` (M, 2) m in the world."""
-        heights = self._field.heights.reshape(len(self._speed), TILE_SAMPLES, -1)
+        width = self._field.heights.shape[1]
         for i in index[self._leaps[index]]:
-            found = trenches(heights[i])
-            if found.size > self._centres.shape[1]:
-                grown = np.full((len(self._speed), found.size), -np.inf)
-                grown[:, : self._centres.shape[1]] = self._centres
-                self._centres = grown
-            self._centres[i, :] = -np.inf
-            self._centres[i, : found.size] = found
+            trenches = self._field.features[int(i), 0].trenches
+            self._plan.look(int(i), trenches, self._landing.spread)
+            self._end[i] = trenches[-1, 1] + _BEYOND
         for i in index[self._pillars[index]]:
-            target = goal[i] - self._origin[i]
-            self._fields[int(i)] = travel_cost(heights[i], self._field.crop, target)
+            pillars, target = self._field.features[int(i), 0].pillars, goal[i] - self._origin[i]
+            self._fields[int(i)] = travel_cost(pillars, width, self._field.crop, target)
 
     def commands(self, loco: Locomotion, goal: Array) -> Array:
         """Commands (M, 15) for the coming decision; ``goal`` (M, 2) m in the world."""
@@ -201,20 +178,23 @@ class Teacher:
         command = self._command.copy()
         speed, turn = toward(distance, error, self._speed)
         command[:, INDEX["vx"]], command[:, INDEX["yaw_rate"]] = speed, turn
-        leaping = self._leaps & (local[:, 0] < self._centres.max(axis=1) + _BEYOND)
-        command[:, 12:] = gait_embedding(np.where(leaping, self._gait, 0))
-        rows = np.flatnonzero(leaping)
+        rows = np.flatnonzero(self._leaps & (local[:, 0] < self._end))
         if rows.size:
-            frequency = straddling_frequency(
+            # Facing across the trenches both feet of a pair land on one line; sideways to the goal.
+            leaps, fast = command[rows], self._speed[rows]
+            leaps[:, INDEX["vx"]] = fast * np.cos(bearing[rows])
+            leaps[:, INDEX["vy"]] = np.clip(fast * np.sin(bearing[rows]), *CommandRanges().vy)
+            turn = np.clip(-_LEAP_TURN * state.yaw[rows], *CommandRanges().yaw_rate)
+            leaps[:, INDEX["yaw_rate"]] = turn
+            steps = self._plan.steps(
+                rows,
                 local[rows, 0],
                 state.heading_vel[rows, 0],
                 loco.clock.clock[rows],
-                np.full(rows.size, STRIDE),
-                command[rows, INDEX["stance_length"]],
-                self._centres[rows],
                 self._landing,
             )
-            command[rows, INDEX["frequency"]] = np.clip(frequency, *CommandRanges().frequency)
+            leap_command(leaps, *steps)
+            command[rows] = leaps
         return command
 
 

@@ -5,9 +5,11 @@ A tile is a height field h(x, y) of 8 m x 8 m; x is the direction of travel. Alo
     0      1.25   1.5                                     6.5   6.75      8 m
     | start | band |             challenge zone            | band | goal |
 
-and one number, the difficulty d, scales one geometric parameter per family (Eq. 1). Ranges and
-shapes are those of TDGC-Bench. All lengths are in m, all angles in rad; arrays are indexed
-[ix, iy], so sample [ix, iy] lies at (ix * CELL, iy * CELL).
+and one number, the difficulty d, scales one geometric parameter per family (Eq. 1). The parameter
+is exact; the layout is drawn for each tile from its own generator. Ranges and shapes are those of
+TDGC-Bench 2. A tile carries its features (trenches, risers, pillars, slope), so that nobody has to
+look for them in the heights. All lengths are in m, all angles in rad; arrays are indexed [ix, iy],
+so sample [ix, iy] lies at (ix * CELL, iy * CELL).
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import math
 import re
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 HeightArray = NDArray[np.float32]
+
+#: Edition of TDGC-Bench that these tiles belong to; in the first one layouts were fixed.
+EDITION = 2
 
 # Families and levels: Sec. III-A; Mixed and the levels past 10 are only ever evaluated on.
 FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
@@ -50,25 +55,28 @@ YAW_SPREAD = 0.5  # rad, start: yaw uniform in +- 0.5
 
 # p_min and p_max of Eq. (1), at d = 0 and d = 1 (TDGC-Bench, table of families).
 PARAMETER_RANGES: dict[str, tuple[float, float]] = {
-    "rough": (0.01, 0.08),  # amplitude A, m
+    "rough": (0.01, 0.10),  # amplitude A, m
     "pillar": (4.0, 24.0),  # number of cylinders in a whole zone
-    "stair": (0.03, 0.13),  # step height h_s, m
-    "gap": (0.05, 0.25),  # gap width w, m
-    "tilt": (0.0, 0.40),  # lateral slope angle theta, rad
+    "stair": (0.03, 0.15),  # step height h_s, m
+    "gap": (0.05, 0.30),  # mean gap width w, m
+    "tilt": (0.0, 0.45),  # lateral slope angle theta, rad
 }
 
-# What does not change with difficulty (same table).
-LATTICE = 0.2  # m, spacing of the Rough noise
-TREAD = 0.30  # m
-TRENCH_SPACING = 1.25  # m, centre to centre: four in a whole zone
+# What layouts are drawn from, the same at every difficulty (same table).
+LATTICES = (0.1, 0.15, 0.2, 0.25, 0.3)  # m, spacing of the Rough noise
+TREAD_CELLS = (5, 8)  # cells, shortest and longest tread: 0.25-0.40 m
+LANDING_CELLS = 6  # cells, the least landing between up and down: 0.30 m
+TRENCHES = (3, 5)  # fewest and most in a whole zone
+TRENCH_SPACING = 0.75  # m, least distance between two centres
+TRENCH_MARGIN = 0.3  # m, least distance of a centre from the ends of the zone
 TRENCH_DEPTH = 0.6  # m
 PILLAR_DIAMETER = (0.2, 0.4)  # m
 PILLAR_HEIGHT = 0.8  # m
 PILLAR_CLEARANCE = 0.6  # m, free way between any two
 
 # Bullet keeps the height range of a field's first upload, so it is pinned to what any tile can
-# need: Tilt at level 12 reaches W/2 tan(0.48 rad) = 2.08 m either way, everything else less.
-HEIGHT_RANGE = (-2.1, 2.1)  # m
+# need: Tilt at level 12 reaches W/2 tan(0.54 rad) = 2.40 m either way, everything else less.
+HEIGHT_RANGE = (-2.5, 2.5)  # m
 # btHeightfieldTerrainShape cuts larger fields off without a word.
 MAX_SAMPLES = 2_097_152
 
@@ -78,9 +86,6 @@ TRAIN_STREAM = 1
 EVAL_STREAM = 2
 
 _X = np.arange(TILE_SAMPLES) / round(1 / CELL)  # m; i / 20 is exact wherever i * 0.05 may not be
-# Hat functions of the Rough lattice at every sample: hat @ nodes @ hat.T interpolates bilinearly.
-_NODES = round(TILE_SIZE / LATTICE) + 1
-_HAT = np.maximum(0.0, 1.0 - np.abs(_X[:, None] / LATTICE - np.arange(_NODES)))
 
 
 class Section(NamedTuple):
@@ -106,6 +111,37 @@ HALF_ZONES = (
 
 
 @dataclass(frozen=True, eq=False)
+class Features:
+    """What a tile is made of, in its frame and from the start to the goal.
+
+    Attributes
+    ----------
+    trenches : (k, 2) float64, m
+        x of both lips of each trench, where its walls meet the ground.
+    risers : (k, 2) float64, m
+        x of the middle of each riser, and how far the ground rises there (down is negative).
+    pillars : (k, 3) float64, m
+        x, y of the axis and diameter of each cylinder.
+    slope : float, rad
+        Lateral slope: positive where the ground rises to the left.
+    """
+
+    trenches: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    risers: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    pillars: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    slope: float = 0.0
+
+    def __add__(self, other: Features) -> Features:
+        """Those of two stretches of one tile; slopes do not add up, a tile has one at most."""
+        return Features(
+            np.vstack([self.trenches, other.trenches]),
+            np.vstack([self.risers, other.risers]),
+            np.vstack([self.pillars, other.pillars]),
+            self.slope or other.slope,
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Tile:
     """One terrain tile in its own frame: sample [0, 0] at (0, 0).
 
@@ -124,6 +160,8 @@ class Tile:
     difficulty : float
     parts : tuple of str
         The families met along x: `(family,)`, or the two halves of Mixed.
+    features : Features
+        Its trenches, risers, pillars and slope.
     cell : float, m
     """
 
@@ -134,6 +172,7 @@ class Tile:
     family: str
     difficulty: float
     parts: tuple[str, ...]
+    features: Features = field(default_factory=Features)
     cell: float = CELL
 
 
@@ -184,11 +223,14 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
 
     heights = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
     support = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
+    features = Features()
     for part, section in zip(parts, sections, strict=True):
         if is_map(part):
             relief = difficulty * _blend(section, BAND)[:, None] * height_map(part)
         else:
-            relief = _SURFACES[part](section, difficulty_parameter(part, difficulty), rng)
+            parameter = difficulty_parameter(part, difficulty)
+            relief, found = _SURFACES[part](section, parameter, rng)
+            features += found
         heights += relief
         if part not in _ON_FLAT_BASE:
             support += relief
@@ -200,88 +242,101 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
         family,
         float(difficulty),
         parts,
+        features,
     )
 
 
 # One function per family: (section, p(d), rng) -> relief in m, broadcastable to (161, 161) and
-# zero outside the section, so that sections add up to a tile.
+# zero outside the section, so that sections add up to a tile; and what the relief consists of.
+Relief = tuple[FloatArray, Features]
 
 
-def rough(section: Section, amplitude: float, rng: np.random.Generator) -> FloatArray:
+def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relief:
     """h = A n(x, y): bilinear uniform noise, zero-mean, max |n| = 1 where fully blended in."""
-    noise = _HAT @ rng.uniform(-1.0, 1.0, (_NODES, _NODES)) @ _HAT.T
+    lattice = LATTICES[rng.integers(len(LATTICES))]
+    nodes = math.ceil(TILE_SIZE / lattice) + 1
+    # Hat functions of the lattice at every sample: hat @ nodes @ hat.T interpolates bilinearly.
+    hat = np.maximum(0.0, 1.0 - np.abs(_X[:, None] / lattice - np.arange(nodes)))
+    noise = hat @ rng.uniform(-1.0, 1.0, (nodes, nodes)) @ hat.T
     blend = _blend(section, BAND)
     core = blend == 1.0
     noise -= noise[core].mean()
     noise /= np.abs(noise[core]).max()
-    relief: FloatArray = amplitude * blend[:, None] * noise
-    return relief
+    return amplitude * blend[:, None] * noise, Features()
 
 
-def pillar(section: Section, count: float, rng: np.random.Generator) -> FloatArray:
+def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
     """Cylinders on a flat base; a section gets its share of the whole zone's `count`.
 
     A sample within a cylinder's radius is raised, so a wall leans outwards over one cell.
     """
-    share = (section.end - section.begin) / (ZONE[1] - ZONE[0])
-    x, y, diameter = place_pillars(section, round(count * share), rng).T
+    pillars = place_pillars(section, round(count * _share(section)), rng)
     relief = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
-    for cx, cy, d in zip(x, y, diameter, strict=True):
+    for cx, cy, d in pillars:
         relief[(_X[:, None] - cx) ** 2 + (_X - cy) ** 2 <= (d / 2) ** 2] = PILLAR_HEIGHT
-    return relief
+    return relief, Features(pillars=pillars)
 
 
-def stair(section: Section, step_height: float, rng: np.random.Generator) -> FloatArray:
-    """As many whole treads up as half a section holds, a landing, the mirror image down.
+def stair(section: Section, step_height: float, rng: np.random.Generator) -> Relief:
+    """As many steps up and as many down again as the section holds, a landing between.
 
-    A whole zone has 8 steps each way. Riser k climbs over the single cell that follows
-    begin + 0.30 k (the steepest a grid can be), so step k + 1 is level from there to the next.
+    A riser climbs over a single cell, the steepest a grid can be, and the tread behind it is drawn
+    from `TREAD_CELLS`, its riser's cell included. What room is left is shared at random between
+    the ground before the first riser, the landing and the ground behind the last.
     """
-    steps = int((section.end - section.begin) / 2 / TREAD)
-    tread = round(TREAD / CELL)
-    i = np.arange(TILE_SAMPLES)
-    into = np.minimum(i - _sample(section.begin), _sample(section.end) - i)  # from the nearer end
-    relief: FloatArray = step_height * np.clip(-(-into // tread), 0, steps)
-    return relief[:, None]
+    cells = _sample(section.end) - _sample(section.begin)
+    low, high = TREAD_CELLS
+    up, down = rng.integers(low, high + 1, (2, cells // low))  # more than can fit
+    # n risers have n - 1 treads between them, and the last one a cell of its own.
+    length = 2 + np.cumsum(np.concatenate([[0], up + down])) + LANDING_CELLS
+    steps = int(np.searchsorted(length, cells, side="right"))
+    spare = cells - length[steps - 1]
+    before, behind = np.sort(rng.integers(0, spare + 1, 2))
+    first = _sample(section.begin) + before + np.concatenate([[0], np.cumsum(up[: steps - 1])])
+    last = _sample(section.end) - (spare - behind) - 1
+    back = last - np.concatenate([[0], np.cumsum(down[: steps - 1])])
+    rise = np.zeros(TILE_SAMPLES)
+    rise[first + 1], rise[back + 1] = step_height, -step_height
+    middle = (np.concatenate([first, back[::-1]]) + 0.5) * CELL
+    risers = np.column_stack([middle, np.repeat([step_height, -step_height], steps)])
+    # Counted in steps, so that the ground behind the stair is level to the last digit.
+    return step_height * np.cumsum(np.sign(rise))[:, None], Features(risers=risers)
 
 
-def gap(section: Section, width: float, rng: np.random.Generator) -> FloatArray:
-    """Trenches across the whole tile, 1.25 m apart.
+def gap(section: Section, width: float, rng: np.random.Generator) -> Relief:
+    """Trenches across the whole tile, at random but `TRENCH_SPACING` apart.
 
-    Widths are quantised: n = round(w / cell) >= 1 samples are lowered, and as the walls lean over
-    one cell on either side, a trench measures (n - 1, n, n + 1) cells at bottom, half depth, top.
+    Each lowers floor or ceil of w / cell samples, at random so that the mean width is w. As the
+    walls lean over one cell on either side, a trench of n samples measures n - 1, n and n + 1 cells
+    at its bottom, at half its depth and at its top.
     """
-    first, lowered = _trenches(section, width)
+    share = _share(section)
+    count = round(share * rng.integers(TRENCHES[0], TRENCHES[1] + 1))
+    cells = round(width / CELL, 6)
+    lowered = math.floor(cells) + (rng.uniform(size=count) < cells % 1.0)
+    # Snapping to the grid moves centres by less than a cell to the right, so one is kept in hand.
+    spacing = TRENCH_SPACING + CELL
+    room = section.end - section.begin - 2.0 * TRENCH_MARGIN - CELL - (count - 1) * spacing
+    free = np.sort(rng.uniform(0.0, room, count))
+    centres = section.begin + TRENCH_MARGIN + free + spacing * np.arange(count)
+    first = np.ceil(centres / CELL - 0.5 * (lowered - 1)).astype(int)
     relief = np.zeros(TILE_SAMPLES)
-    for sample in first:
-        relief[sample : sample + lowered] = -TRENCH_DEPTH
-    return relief[:, None]
+    for sample, n in zip(first, lowered, strict=True):
+        relief[sample : sample + n] = -TRENCH_DEPTH
+    trenches = CELL * np.column_stack([first - 1, first + lowered])
+    return relief[:, None], Features(trenches=trenches)
 
 
-def _trenches(section: Section, width: float) -> tuple[NDArray[np.int64], int]:
-    """First lowered sample of each trench, and how many are lowered."""
-    lowered = max(1, round(width / CELL))
-    spacing = round(TRENCH_SPACING / CELL)
-    count = round((section.end - section.begin) / TRENCH_SPACING)
-    # Centres fall between two samples, so an odd n sits half a cell towards the start.
-    halves = (2 * np.arange(count) + 1) * spacing - lowered + 1
-    return _sample(section.begin) + halves // 2, lowered
+def tilt(section: Section, angle: float, rng: np.random.Generator) -> Relief:
+    """h = +-(y - W/2) tan(theta), either side as likely, blended in and out."""
+    slope = float(rng.choice([-1.0, 1.0])) * angle
+    relief = _blend(section, TILT_BAND)[:, None] * (_X - TILE_SIZE / 2) * math.tan(slope)
+    return relief, Features(slope=slope)
 
 
-def trench_centres(difficulty: float) -> FloatArray:
-    """Middle of each trench of a Gap tile along x, (4,) m.
-
-    Raises:
-        ValueError: a difficulty out of range.
-    """
-    first, lowered = _trenches(WHOLE_ZONE, difficulty_parameter("gap", difficulty))
-    return np.asarray(CELL * (first + 0.5 * (lowered - 1)))
-
-
-def tilt(section: Section, angle: float, rng: np.random.Generator) -> FloatArray:
-    """h = (y - W/2) tan(theta), blended in and out."""
-    slope: FloatArray = (_X - TILE_SIZE / 2) * math.tan(angle)
-    return _blend(section, TILT_BAND)[:, None] * slope
+def _share(section: Section) -> float:
+    """The section's length over that of a whole zone."""
+    return (section.end - section.begin) / (ZONE[1] - ZONE[0])
 
 
 def is_map(family: str) -> bool:
@@ -345,7 +400,7 @@ def place_pillars(section: Section, count: int, rng: np.random.Generator) -> Flo
     raise RuntimeError(f"no room for {count} pillars between x = {section.begin} and {section.end}")
 
 
-_SURFACES: dict[str, Callable[[Section, float, np.random.Generator], FloatArray]] = {
+_SURFACES: dict[str, Callable[[Section, float, np.random.Generator], Relief]] = {
     "rough": rough,
     "pillar": pillar,
     "stair": stair,
@@ -384,6 +439,8 @@ class TileField:
         See `Tile`; n is 161 less the crop. `place` overwrites them in place.
     starts, goals : (rows, cols, 3) and (rows, cols, 2)
         Each tile's own start (x, y, yaw) and goal (x, y), in the tile's frame.
+    features : dict of (row, col) -> Features
+        Of the tiles placed so far, each in its tile's frame.
     """
 
     def __init__(self, shape: tuple[int, int], crop: float = 0.0) -> None:
@@ -398,6 +455,7 @@ class TileField:
         self.heights: HeightArray = np.zeros((rows * TILE_SAMPLES, cols * self._width), np.float32)
         self.support: HeightArray = np.zeros_like(self.heights)
         self.starts, self.goals = np.zeros((rows, cols, 3)), np.zeros((rows, cols, 2))
+        self.features: dict[tuple[int, int], Features] = {}
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -412,6 +470,7 @@ class TileField:
         self.heights[where] = tile.heights[:, cut : cut + m]
         self.support[where] = tile.support[:, cut : cut + m]
         self.starts[row, col], self.goals[row, col] = tile.start, tile.goal
+        self.features[row, col] = tile.features
 
     def origin(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
         """World xy (..., 2) in m of the origin of the frames of the tiles at (row, col)."""

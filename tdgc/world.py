@@ -79,6 +79,7 @@ class World:
     Attributes:
         state: the ``RobotState`` after the last step, push or reset.
         strength: (M, 1) motor strength, times gains and torque limits.
+        joint_friction: (M, 1) N m, dry friction in each joint.
         bullet_seconds: wall time spent inside Bullet's step so far.
     """
 
@@ -99,6 +100,7 @@ class World:
         self.field = field
         self._visual = visual
         self.strength = np.ones((num_robots, 1))
+        self.joint_friction = np.zeros((num_robots, 1))
         self.bullet_seconds = 0.0
         self.state = RobotState.zeros(read_geometry(robot), num_robots)
         self._clients: list[_Client] = []
@@ -110,7 +112,8 @@ class World:
             client.setGravity(0.0, 0.0, -GRAVITY)
             # No early stop of the solver: it would couple robots through the worst residual.
             client.setPhysicsEngineParameter(
-                fixedTimeStep=physics.dt,
+                fixedTimeStep=physics.hold * physics.dt,
+                numSubSteps=physics.hold if physics.hold > 1 else 0,
                 numSolverIterations=physics.solver_iterations,
                 solverResidualThreshold=0.0,
                 deterministicOverlappingPairs=1,
@@ -121,6 +124,7 @@ class World:
                 self._client_of.append(client)
                 client.rows[self._bodies[-1]] = int(rows[k])
             self._clients.append(client)
+        self._joint_inertia = [self._inertia_about_joint(joint) for joint in self._joints]
         trunk = self._client_of[0].getDynamicsInfo(self._bodies[0], -1)
         # Bullet's pose of a robot is that of its trunk's inertia: where its centre of mass is in
         # the trunk's frame, and how the axes of its inertia are turned there.
@@ -316,14 +320,38 @@ class World:
         for i in self._active:
             self._put(int(i))
 
-    def set_dynamics(self, index: ArrayLike, friction: Array, payload: Array) -> None:
-        """Friction of every link and extra mass of the trunk, (n,) and (n,) kg."""
+    def _inertia_about_joint(self, joint: int) -> tuple[list[float], int]:
+        """Principal inertia of a joint's link, (3,) kg m^2, and which is nearest to its axis."""
+        client, body = self._client_of[0], self._bodies[0]
+        inertia, _, turned = client.getDynamicsInfo(body, joint)[2:5]
+        axis = np.array(client.getJointInfo(body, joint)[13])
+        along = rotation_matrix(np.array([turned]))[0].T @ axis
+        return list(inertia), int(np.abs(along).argmax())
+
+    def set_dynamics(
+        self, index: ArrayLike, friction: Array, payload: Array, armature: Array
+    ) -> None:
+        """Friction of every link, extra mass of the trunk, rotor inertia of the joints.
+
+        Bullet's joints have no inertia of their own, so it is the links' about their joints; other
+        than a rotor's it also resists a turn of all links together.
+
+        Args:
+            index: (n,) robots.
+            friction: (n,).
+            payload: (n,) kg.
+            armature: (n,) kg m^2.
+        """
         nominal = self.state.geometry.trunk_mass
         for k, i in enumerate(np.asarray(index)):
             body, client = self._bodies[i], self._client_of[i]
             mass = nominal + float(payload[k])
             for link in (*self._trunk_links, *self._leg_of_link):
                 client.changeDynamics(body, link, lateralFriction=float(friction[k]))
+            for joint, (inertia, axis) in zip(self._joints, self._joint_inertia, strict=True):
+                about = inertia.copy()
+                about[axis] += float(armature[k])
+                client.changeDynamics(body, joint, localInertiaDiagonal=about)
             # Spread over the trunk, the payload scales its inertia.
             client.changeDynamics(
                 body,
@@ -356,8 +384,9 @@ class World:
             offset: (M, 12) rad, error of each joint's zero.
         """
         live, state = self._active, self.state
-        # Targets of each physics step: those of the control step that has taken effect by then.
-        passed = self.physics.dt * np.arange(self.physics.substeps)[:, None]
+        # Targets of each joint control: those of the control step that has taken effect by then.
+        interval = self.physics.hold * self.physics.dt
+        passed = interval * np.arange(self.physics.joint_steps)[:, None]
         age = np.ceil(np.maximum(delay[live] - passed - 1e-9, 0.0) / self.physics.control_dt)
         wanted = targets[age.astype(int), live] + offset[live]
         state.trunk_force = np.zeros(self.num_robots)
@@ -370,8 +399,8 @@ class World:
         self._read_contacts()
 
     def _step_client(self, client: _Client, live: NDArray[np.integer], wanted: Array) -> None:
-        """All physics steps of one client's robots ``live`` (n,), with ``wanted`` (substeps, n, 12)
-        rad, their joint targets at each.
+        """All physics steps of one client's robots ``live`` (n,), with ``wanted`` (k, n, 12) rad,
+        their joint targets at each of k joint controls.
 
         One client after another, since the processor's cache holds one but not all: with 50 robots
         in 5 clients Bullet took half as long again when they took turns at every physics step.
@@ -380,10 +409,10 @@ class World:
         bodies = [self._bodies[i] for i in live]
         # At these calls, one a robot and physics step, even a client's bound functions are slow.
         command, measure = pybullet.setJointMotorControlArray, pybullet.getJointStates
-        strength = self.strength[live]
+        strength, friction = self.strength[live], self.joint_friction[live]
         q, qd = state.q[live], state.qd[live]
         for target in wanted:
-            torque = pd_torque(target - q, qd, strength, self.robot)
+            torque = pd_torque(target - q, qd, strength, self.robot, friction)
             for body, forces in zip(bodies, torque.tolist(), strict=True):
                 command(
                     body,
