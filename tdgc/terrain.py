@@ -262,7 +262,8 @@ def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relie
     core = blend == 1.0
     noise -= noise[core].mean()
     noise /= np.abs(noise[core]).max()
-    return amplitude * blend[:, None] * noise, Features()
+    # Higher peaks are possible where the noise is still blended in.
+    return amplitude * blend[:, None] * np.clip(noise, -1.0, 1.0), Features()
 
 
 def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
