@@ -31,8 +31,8 @@ class ConfigError(InputError):
 class RobotConfig:
     """The robot and its joint interface (paper Sec. IV-A, q* = q0 + alpha clip(a)).
 
-    Masses, lengths and joint limits are read from the URDF (``tdgc.geometry``); leg order FL, FR,
-    RL, RR everywhere and joints hip, thigh, calf within a leg.
+    Masses, lengths and joint limits are read from the URDF (``tdgc.sim.geometry``); leg order FL,
+    FR, RL, RR everywhere and joints hip, thigh, calf within a leg.
     """
 
     urdf: str = "urdf/quadruped.urdf"  # path, from here or from the repository
@@ -101,7 +101,7 @@ class CommandRanges:
 
 @dataclass(frozen=True)
 class LowRewardConfig:
-    """Weights of the low-level reward, one field per term of ``tdgc.rewards.LOW_TERMS``.
+    """Weights of the low-level reward, one field per term of ``tdgc.tasks.rewards.LOW_TERMS``.
 
     Values of Walk These Ways (its published table), but for the first two; ``power`` is ours and is
     multiplied by the commanded ``power_weight``.
@@ -182,7 +182,8 @@ class LowLevelConfig:
 class HighRewardConfig:
     """Weights and constants of the high-level reward (Sec. IV-B), one weight per term.
 
-    Weights are per second: ``tdgc.rewards.high_terms`` multiplies them by the step's duration.
+    Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the step's
+    duration.
     """
 
     goal_distance: float = 1.0
