@@ -16,14 +16,15 @@ import sys
 import torch as th
 from stable_baselines3 import PPO
 
-from tdgc import __version__, plots, policies
+from tdgc import __version__, policies
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, to_dict
-from tdgc.low_env import LowLevelTask, make_task, summarise
+from tdgc.learn.training import Phase, add_arguments, configure, run
+from tdgc.parallel.vec import TaskVecEnv
+from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
-from tdgc.tiles import check_families
-from tdgc.training import Phase, add_arguments, configure, run
-from tdgc.vec import TaskVecEnv
-from tdgc.worker import MakeLink, WorkerError
+from tdgc.show import plots
+from tdgc.tasks.low_env import LowLevelTask, make_task, summarise
+from tdgc.tasks.tiles import check_families
 
 
 def phases(config: LowTrainConfig, device: str) -> list[Phase]:

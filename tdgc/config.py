@@ -33,8 +33,8 @@ class ConfigError(InputError):
 class RobotConfig:
     """The robot and its joint interface (paper Sec. IV-A, q* = q0 + alpha clip(a)).
 
-    Masses, lengths and joint limits are read from the URDF (``tdgc.geometry``); leg order FL, FR,
-    RL, RR everywhere and joints hip, thigh, calf within a leg.
+    Masses, lengths and joint limits are read from the URDF (``tdgc.sim.geometry``); leg order FL,
+    FR, RL, RR everywhere and joints hip, thigh, calf within a leg.
     """
 
     urdf: str = "urdf/quadruped.urdf"  # path, from here or from the repository
@@ -122,7 +122,7 @@ class CommandRanges:
 
 @dataclass(frozen=True)
 class LowRewardConfig:
-    """Weights of the low-level reward, one field per term of ``tdgc.rewards.LOW_TERMS``.
+    """Weights of the low-level reward, one field per term of ``tdgc.tasks.rewards.LOW_TERMS``.
 
     Penalties of Walk These Ways (its published table), some changed by up to a factor of two where
     the first policies showed the need (docs/experiments.md); ``power`` is ours and is multiplied by
@@ -212,7 +212,8 @@ class LowLevelConfig:
 class HighRewardConfig:
     """Weights and constants of the high-level reward (Sec. IV-B), one weight per term.
 
-    Weights are per second: ``tdgc.rewards.high_terms`` multiplies them by the step's duration.
+    Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the step's
+    duration.
     """
 
     goal_distance: float = 1.0

@@ -34,7 +34,11 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from tdgc import __version__
-from tdgc.commands import (
+from tdgc.benchmark.drivers import load_high
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
+from tdgc.errors import install_hint
+from tdgc.policies import Policy
+from tdgc.sim.commands import (
     CONTINUOUS,
     INDEX,
     NAMES,
@@ -45,12 +49,20 @@ from tdgc.commands import (
     default_command,
     observed_command,
 )
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
-from tdgc.drivers import load_high
-from tdgc.errors import install_hint
-from tdgc.gaits import FEET, GAIT_TABLE, GAITS
-from tdgc.geometry import FRONT, JOINTS, SIDE, read_geometry
-from tdgc.high_env import (
+from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
+from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry
+from tdgc.sim.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE
+from tdgc.sim.robot import (
+    HIGHEST_FOOT,
+    NUM_JOINTS,
+    Array,
+    action_scale,
+    foot_kinematics,
+    joint_targets,
+    nominal_pose,
+    target_limits,
+)
+from tdgc.tasks.high_env import (
     GOAL_SCALE,
     PRETRAINED,
     PROBE_RANGE,
@@ -62,19 +74,7 @@ from tdgc.high_env import (
     load_low,
     observe_high,
 )
-from tdgc.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE
-from tdgc.low_env import is_fallen
-from tdgc.policies import Policy
-from tdgc.robot import (
-    HIGHEST_FOOT,
-    NUM_JOINTS,
-    Array,
-    action_scale,
-    foot_kinematics,
-    joint_targets,
-    nominal_pose,
-    target_limits,
-)
+from tdgc.tasks.low_env import is_fallen
 
 #: Formats and the endings of their files.
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}

@@ -6,8 +6,8 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
-from tdgc import terrain
-from tdgc.terrain import (
+from tdgc.sim import terrain
+from tdgc.sim.terrain import (
     ALL_FAMILIES,
     EVAL_STREAM,
     FAMILIES,
