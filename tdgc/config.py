@@ -291,6 +291,14 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
+class CalibrationConfig:
+    """Calibration of the low policy (``tdgc.calibration``), the end of a run of train_low.py."""
+
+    robots: int = 4800  # that walk to be measured; 0 leaves the policy as it is
+    turns: int = 60  # of 60 control steps each, in which the copy learns
+
+
+@dataclass(frozen=True)
 class LowTrainConfig:
     """A run of train_low.py: robots on a plane and on terrain, then calibration."""
 
@@ -305,6 +313,7 @@ class LowTrainConfig:
     checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
     env: LowLevelConfig = field(default_factory=LowLevelConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from tdgc.sim.gaits import GAITS, gait_embedding, swing_profile
 from tdgc.sim.locomotion import (
     ACTOR_LAYOUT,
     GYRO_LAYOUT,
+    GYRO_SCALE,
     SPEED_SCALE,
     Locomotion,
     action_mirror,
@@ -144,7 +145,12 @@ def test_noise_is_on_measured_parts_only_and_within_its_width(loco: Locomotion) 
     noise = RandomisationConfig(noise_gravity=0.05, noise_joint_angle=0.01, noise_joint_speed=1.5)
     rng = np.random.default_rng(0)
     error = np.array([loco.observe(Noise(noise, rng)) - quiet for _ in range(200)])
-    widths = {"gravity": 0.05, "joint_error": 0.01, "joint_speed": 1.5 * SPEED_SCALE}
+    widths = {
+        "gravity": 0.05,
+        "joint_error": 0.01,
+        "joint_speed": 1.5 * SPEED_SCALE,
+        "gyro": 0.1 * GYRO_SCALE,
+    }
     for name, where in ACTOR.items():
         largest = np.abs(error[..., where]).max(axis=(0, 1))
         width = widths.get(name, 0.0)
@@ -424,7 +430,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
     assert np.abs(probes[:, 0] - probes[:, 2]).max() > 0.04 and np.ptp(probes[:, 1]) > 0.2
     assert np.ptp(critic[where["foot_height"]]) > 0.005
     dynamics = critic[where["dynamics"]].tolist()
-    assert dynamics == pytest.approx([0.6, 0.5, 0.0, 0.4])
+    assert dynamics == pytest.approx([0.6, 0.5, 0.0, 0.4, 0.0, 0.0])
     task.close()
 
 
