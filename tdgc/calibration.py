@@ -25,7 +25,8 @@ import torch as th
 from torch import nn
 
 from tdgc import policies
-from tdgc.benchmark.evaluation import draw_commands, spread, walk_on_plane
+from tdgc.benchmark.evaluation import spread
+from tdgc.benchmark.tracking import draw_commands, walk_on_plane
 from tdgc.config import CalibrationConfig, CommandRanges, LowLevelConfig
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.group import TaskGroup
@@ -37,7 +38,8 @@ from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import ACTOR_LAYOUT, MIRRORS
 from tdgc.sim.robot import Array
 from tdgc.tasks.high_env import load_low
-from tdgc.tasks.low_env import LowLevelTask, is_fallen, make_task
+from tdgc.tasks.low_env import LowLevelTask, make_task
+from tdgc.tasks.rules import is_fallen
 
 #: From the commands asked for to those given, (n, 15) -> (n, 15).
 Correction = Callable[[Array], Array]

@@ -186,6 +186,10 @@ class RandomisationConfig:
     # that sees one step needs its joint speeds to tell how fast the trunk moves.
     noise_joint_speed: float = 0.3  # rad/s
     noise_gyro: float = field(default=0.1, metadata={"before": 0.0})  # rad/s
+    # The high policy's height probes (benchmark's `noise`).
+    noise_probes: float = field(default=0.02, metadata={"before": 0.0})  # m
+    # Share of the robots, drawn for each episode, whose probes are a decision late.
+    probe_delay: float = field(default=0.5, metadata={"before": 0.0})
 
 
 @dataclass(frozen=True)

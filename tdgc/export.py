@@ -58,23 +58,21 @@ from tdgc.sim.robot import (
     Array,
     action_scale,
     foot_kinematics,
-    joint_targets,
     nominal_pose,
     target_limits,
 )
+from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import (
     GOAL_SCALE,
     PRETRAINED,
-    PROBE_RANGE,
-    PROBES,
     SEMANTIC,
     NavigationTask,
-    height_probes,
     high_layout,
     load_low,
     observe_high,
 )
-from tdgc.tasks.low_env import is_fallen
+from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
+from tdgc.tasks.rules import GOING, outcome
 
 #: Formats and the endings of their files.
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
@@ -597,6 +595,29 @@ class Check:
     seconds: Array
 
 
+class _LowGraph:
+    """The low policy's graph as what acts, with the policy beside it.
+
+    Attributes:
+        differences: of each step's action, one after another.
+        targets: (12,) rad, the last step's joint targets.
+    """
+
+    def __init__(self, graph: Graph, policy: Policy, limit: float, task: NavigationTask) -> None:
+        self._graph, self._policy, self._limit, self._task = graph, policy, limit, task
+        self.differences: list[Array] = []
+        self.targets = np.zeros(NUM_JOINTS)
+
+    def predict(self, obs: ArrayLike) -> tuple[Array, None]:
+        """The graph's action, (1, 12), from what the robot senses; the policy's from ``obs``."""
+        wanted = np.clip(self._policy.predict(obs)[0], -self._limit, self._limit)
+        command = self._task.locomotion.command[0].copy()  # the graph remembers it
+        made = self._graph(_sense(self._task) | {"commands": command})
+        self.differences.append(made["action"] - wanted[0])
+        self.targets = made["joint_targets"]
+        return made["action"][None], None
+
+
 def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     """Let the graphs in ``folder`` drive a robot for as long as an episode, policies beside them.
 
@@ -615,14 +636,16 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     config, limit = pair.high_config, pair.low_config.robot.action_limit
     decide, walk = Graph(folder, "high", form), Graph(folder, "low", form)
     task = NavigationTask(config, low, 1, seed=0, training=False)
-    loco, robot = task.locomotion, np.arange(1)
+    loco = task.locomotion
+    acting = _LowGraph(walk, pair.low, limit, task)
+    executor = Executor(loco, acting)
     differences: list[Array] = []
     seconds: list[float] = []
-    ended = np.ones(1, dtype=bool)
+    ended = True
     try:
         for _ in range(task.horizon):
-            if ended[0]:
-                task.reset(robot)
+            if ended:
+                task.reset(np.arange(1))
                 decide.reset()
                 walk.reset()
                 walk.memory["clock"] = loco.clock.clock
@@ -630,9 +653,14 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
                 state, last = None, np.zeros((1, NUM_ACTIONS), dtype=np.float32)
             # A new episode has the phases of the one before until its first step.
             loco.clock.update(loco.command[:, 12:], loco.command[:, INDEX["duration"]])
-            share, family = task.elapsed / task.horizon, task.family_index
             seen = observe_high(
-                loco, task.goal, share, task.decoder.normalise(last), family, config.cues
+                loco,
+                task.goal,
+                task.elapsed / task.horizon,
+                task.decoder.normalise(last),
+                task.family_index,
+                config.cues,
+                height_probes(loco),
             )
             last, state = pair.high.predict(seen, state)
             made = decide(_sense(task) | {"clock": walk.memory["clock"]})
@@ -640,21 +668,16 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
                 made["decision"] - last[0],
                 made["commands"] - task.decoder.decode(made["decision"]),
             ]
-            loco.command[:] = made["commands"]
             task.elapsed += 1
             for k in range(config.decimation):
-                action = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
-                geometry, wanted = loco.world.state.geometry, action.astype(np.float64)
-                targets = joint_targets(loco.robot, geometry, loco.pose(), wanted)
-                step = walk(_sense(task) | {"commands": made["commands"]})
+                executor.step(made["commands"][None])
+                differences.append(acting.targets - loco.targets[0, 0])
                 seconds.append(walk.seconds + (decide.seconds if k == 0 else 0.0))
-                differences += [step["action"] - action[0], step["joint_targets"] - targets[0]]
-                loco.act(step["action"][None])
-            x, y = loco.world.state.position[:, 0], loco.world.state.position[:, 1]
-            ended = is_fallen(loco.world) | ~task.field.on_tile(robot, 0, x, y)
+            ended = outcome(loco.world)[0] != GOING
     finally:
         task.close()
-    return Check(float(np.abs(np.concatenate(differences)).max()), np.array(seconds))
+    worst = np.abs(np.concatenate(differences + acting.differences)).max()
+    return Check(float(worst), np.array(seconds))
 
 
 def _sense(task: NavigationTask) -> dict[str, Array]:

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from tdgc import export, policies
-from tdgc.config import CommandRanges, HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
+from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
 from tdgc.export import FORMATS, TOLERANCE, Graph, HighLevel, LowLevel
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
@@ -31,9 +31,11 @@ from tdgc.sim.locomotion import (
 )
 from tdgc.sim.robot import JOINTS, nominal_pose
 from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_layout, load_low, observe_high
+from tdgc.tasks.probes import height_probes
 
 LOW = PRETRAINED / "low"
 LOW_POLICY, LOW_CONFIG = load_low(LOW)
+HIGH_CONFIG = HighLevelConfig(commands=LOW_CONFIG.commands)
 
 
 def unbounded(size: int) -> spaces.Box:
@@ -83,7 +85,7 @@ def random_low(path: Path, config: LowLevelConfig, symmetric: bool) -> Policy:
 
 
 def random_commands(rng: np.random.Generator, count: int) -> np.ndarray:
-    decoder = CommandDecoder()
+    decoder = CommandDecoder(HIGH_CONFIG.commands)
     commands = rng.uniform(decoder.low, decoder.high, (count, 15))
     commands[:, 12:] = gait_embedding(np.arange(count) % 4)
     return commands
@@ -128,7 +130,7 @@ def run(level: LowLevel | HighLevel, values: dict[str, np.ndarray]) -> dict[str,
 @pytest.fixture(scope="module")
 def high(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("high") / "policy"
-    return random_high(path, HighLevelConfig())
+    return random_high(path, HIGH_CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +203,7 @@ def test_low_level_is_the_executors_step(
 
 @pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])
 def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: str) -> None:
-    narrow = dataclasses.replace(CommandRanges(), vx=(-0.5, 0.8), pitch=(0.0, 0.0))
+    narrow = dataclasses.replace(HIGH_CONFIG.commands, vx=(-0.5, 0.8), pitch=(0.0, 0.0))
     config = HighLevelConfig(cues=cues, action_limit=2.0, decimation=4, commands=narrow)
     policy = policies.load(random_high(tmp_path / "high", config))
     level = HighLevel(policy, config, LOW_CONFIG)
@@ -216,7 +218,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: s
         elapsed = np.arange(5) * 17
         seen = observe_high(
             loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
-            task.family_index, cues,
+            task.family_index, cues, height_probes(loco),
         )  # fmt: skip
         wanted, (hidden, cell) = policy.predict(seen, (memory[:1], memory[1:]))
         state = loco.world.state
@@ -249,7 +251,10 @@ def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: s
 
 def test_decoding_is_the_decoders_to_the_last_bit_of_a_gait(high: Path) -> None:
     pair = export.load_pair(LOW, high)
-    level, decoder = HighLevel(pair.high, pair.high_config, pair.low_config), CommandDecoder()
+    level, decoder = (
+        HighLevel(pair.high, pair.high_config, pair.low_config),
+        CommandDecoder(HIGH_CONFIG.commands),
+    )
     rng = np.random.default_rng(3)
     actions = rng.uniform(-1.3, 1.3, (40, 13))
     edges = np.float32([-0.5, 0.0, 0.5])
@@ -296,7 +301,7 @@ def test_graphs_drive_a_robot_as_the_policies_do(folder: Path, high: Path, form:
 
 
 def test_check_finds_other_weights(tmp_path: Path) -> None:
-    short = HighLevelConfig(episode_seconds=1.0)
+    short = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
     other = random_high(tmp_path / "short", short)
     pair = export.load_pair(LOW, other)
     export.write(pair, tmp_path, ["torchscript"])
@@ -403,7 +408,7 @@ def test_a_robot_needs_no_part_of_this_package(folder: Path) -> None:
 def test_command_writes_checks_and_reports(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    short = HighLevelConfig(episode_seconds=1.0)
+    short = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
     high = random_high(tmp_path / "high", short)
     out = tmp_path / "new" / "out"
     arguments = ["--high", str(high), "--out", str(out), "--format", "torchscript"]
@@ -424,12 +429,12 @@ def test_command_writes_checks_and_reports(
 
 def save_pairs(path: Path) -> None:
     """High levels that do not fit the shipped low level, and one that does."""
-    fast = dataclasses.replace(CommandRanges(), vx=(-1.0, 1.5))
+    fast = dataclasses.replace(HIGH_CONFIG.commands, vx=(-1.0, 1.5))
     physics = dataclasses.replace(LOW_CONFIG.physics, control_dt=0.01)
-    random_high(path / "high", HighLevelConfig(), hidden=4)
+    random_high(path / "high", HIGH_CONFIG, hidden=4)
     random_high(path / "fast", HighLevelConfig(commands=fast), hidden=4)
     random_high(
-        path / "slow", HighLevelConfig(), dataclasses.replace(LOW_CONFIG, physics=physics), hidden=4
+        path / "slow", HIGH_CONFIG, dataclasses.replace(LOW_CONFIG, physics=physics), hidden=4
     )
     for name, stem, key, value in (
         ("blind", path / "high", "cues", "none"),

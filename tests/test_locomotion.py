@@ -20,6 +20,7 @@ from tdgc.sim.locomotion import (
     action_mirror,
 )
 from tdgc.sim.robot import Array, commanded_pose, nominal_pose
+from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, Tile, make_tile
 from tdgc.tasks.low_env import CRITIC_LAYOUT, LowLevelTask
 
@@ -143,7 +144,7 @@ def test_noise_is_on_measured_parts_only_and_within_its_width(loco: Locomotion) 
     quiet = loco.observe()
     noise = RandomisationConfig(noise_gravity=0.05, noise_joint_angle=0.01, noise_joint_speed=1.5)
     rng = np.random.default_rng(0)
-    error = np.array([loco.observe(noise, rng) - quiet for _ in range(200)])
+    error = np.array([loco.observe(Noise(noise, rng)) - quiet for _ in range(200)])
     widths = {
         "gravity": 0.05,
         "joint_error": 0.01,
@@ -157,7 +158,7 @@ def test_noise_is_on_measured_parts_only_and_within_its_width(loco: Locomotion) 
         assert (largest >= 0.9 * width).all(), name
         assert abs(error[..., where].mean()) <= 0.05 * width, name
     off = dataclasses.replace(noise, scale=0.0)
-    assert (loco.observe(off, rng) == quiet).all()
+    assert (loco.observe(Noise(off, rng)) == quiet).all()
     assert (loco.observe() == quiet).all()
 
 

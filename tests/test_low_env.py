@@ -13,7 +13,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-import tdgc.tasks.low_env as low_env
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.sim.commands import INDEX, default_command, gait_index
 from tdgc.sim.gaits import gait_embedding
@@ -25,10 +24,10 @@ from tdgc.tasks.low_env import (
     CRITIC_LAYOUT,
     LowLevelEnv,
     LowLevelTask,
-    is_fallen,
     shallow,
     summarise,
 )
+from tdgc.tasks.rules import is_fallen
 
 NOMINAL = nominal_pose(RobotConfig())
 PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4, hold=1))
@@ -891,7 +890,3 @@ def test_seeds_differ() -> None:
     assert (first.observe() != second.observe()).any()
     first.close()
     second.close()
-
-
-def test_constants_of_the_paper() -> None:
-    assert (low_env.FALL_HEIGHT, low_env.TRUNK_FORCE, low_env.GOAL_RADIUS) == (0.15, 40.0, 0.5)

@@ -18,7 +18,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import ALL_FAMILIES, HEIGHT_RANGE, TileField, make_tile, tile_rng
 from tdgc.sim.world import CLIENT_ROBOTS, World
-from tdgc.tasks.low_env import is_fallen
+from tdgc.tasks.rules import is_fallen
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()
 GEOMETRY, NOMINAL = read_geometry(ROBOT), nominal_pose(ROBOT)
