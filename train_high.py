@@ -29,7 +29,7 @@ from tdgc.policies import Policy
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.high_env import NavigationTask, check_pair, load_low, summarise
+from tdgc.tasks.high_env import NavigationTask, load_low, paired, summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.teacher import check_styles
 from tdgc.tasks.tiles import check_families
@@ -128,7 +128,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = configure(HighTrainConfig(), args)
         low, low_config = load_low(config.low)
-        check_pair(config.env, low_config)
+        config = dataclasses.replace(config, env=paired(config.env, low_config))
         check_families(config.env.families)
         unknown = config.env.unknown_share
         if not 0.0 <= unknown <= 1.0:

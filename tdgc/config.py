@@ -259,7 +259,8 @@ class HighLevelConfig:
     episode_seconds: float = 20.0  # T_max (benchmark)
     hold_seconds: float = 2.0  # an episode goes on that long after the goal was reached
     action_limit: float = 1.0  # a_max of the decoder
-    commands: CommandRanges = field(default_factory=CommandRanges)  # the decoder's bounds
+    # The decoder's bounds; all that the low policy was trained on where there are none.
+    commands: CommandRanges | None = None
     rewards: HighRewardConfig = field(default_factory=HighRewardConfig)
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
@@ -518,6 +519,10 @@ def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
         raise ConfigError(f"unknown configuration key '{full}'; allowed: {', '.join(names)}")
     child = getattr(config, head)
     if rest:
+        if child is None:  # a table that may be left out
+            options = typing.get_args(typing.get_type_hints(type(config))[head])
+            table = next((o for o in options if dataclasses.is_dataclass(o)), None)
+            child = None if table is None else typing.cast(type, table)()
         if not dataclasses.is_dataclass(child):
             raise ConfigError(f"'{full}': '{head}' is a value, it has no keys of its own")
         return dataclasses.replace(config, **{head: _replace(child, rest, value, full)})

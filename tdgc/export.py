@@ -438,7 +438,7 @@ def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, dict[str
         "rate_hz": 1.0 / (decimation * physics.control_dt),
         "control_steps": decimation,
         "joints": JOINTS,
-        "commands": _commands(pair.high_config.commands),
+        "commands": _commands(pair.high_config.commands or pair.low_config.commands),
         "decision": (*CONTINUOUS, "gait"),
         "families": SEMANTIC,
         "probes": {"unit": "m", "ahead_left": PROBES.tolist()},

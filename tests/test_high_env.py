@@ -19,9 +19,9 @@ from tdgc.tasks.high_env import (
     PRETRAINED,
     SEMANTIC,
     NavigationTask,
-    check_pair,
     high_layout,
     load_low,
+    paired,
 )
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rewards import HighStep
@@ -333,9 +333,9 @@ def test_bounds_outside_the_low_levels_training_are_refused():
     _, low = load_low(LOW)
     wide = HighLevelConfig(commands=dataclasses.replace(CONFIG.commands, vx=(-1.0, 1.5)))
     with pytest.raises(ConfigError, match=r"commands.vx asks for \[-1.0, 1.5\].*\[-1.0, 1.0\]"):
-        check_pair(wide, low)
+        paired(wide, low)
     narrow = HighLevelConfig(commands=dataclasses.replace(CONFIG.commands, vx=(-0.5, 0.5)))
-    check_pair(narrow, low)
+    paired(narrow, low)
 
 
 def test_nan_action_is_refused(task):

@@ -23,7 +23,7 @@ from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_comman
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
-from tdgc.tasks.high_env import SEMANTIC, check_pair, high_layout, observe_high
+from tdgc.tasks.high_env import SEMANTIC, high_layout, observe_high, paired
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.probes import HeightProbes
 from tdgc.tasks.teacher import Teacher, toward
@@ -112,14 +112,14 @@ class TeacherDriver:
     def __init__(self, low: Policy, config: LowLevelConfig) -> None:
         self.config = HighLevelConfig(cues="none")
         self._landing = measure_landing(low, config)
-        self.bounds = CommandRanges()
+        self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
         assert loco.world.field is not None  # episodes run on tiles
         families = [family] * loco.num_robots
-        self._teacher = Teacher(loco.world.field, families, self._landing)
+        self._teacher = Teacher(loco.world.field, families, self.bounds, self._landing)
         self._teacher.begin(np.arange(loco.num_robots), goal)
 
     def command(self, step: int) -> Array:
@@ -139,6 +139,7 @@ class HierarchyDriver:
 
     def __init__(self, high: Policy, config: HighLevelConfig) -> None:
         self._high, self.config = high, config
+        assert config.commands is not None  # filled in by ``load_high``
         self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
         self._decoder = CommandDecoder(config.commands, config.action_limit)
@@ -213,5 +214,4 @@ def load_high(
     ):
         if wanted != given:
             raise ConfigError(f"{path}: trained for {what.format(wanted)}, not {given}")
-    check_pair(config, low_config)
-    return high, config
+    return high, paired(config, low_config)

@@ -153,19 +153,22 @@ def high_step(
     )
 
 
-def check_pair(high: HighLevelConfig, low: LowLevelConfig) -> None:
-    """Refuse decoder bounds that the low level was not trained on.
+def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
+    """The MDP of a high policy on a low policy: with the decoder's bounds, if it has none.
 
     Raises:
-        ConfigError: names the command and both ranges.
+        ConfigError: bounds that the low policy was not trained on; names the command and both.
     """
+    if high.commands is None:
+        return dataclasses.replace(high, commands=low.commands)
     for f in dataclasses.fields(low.commands):
         asked, trained = getattr(high.commands, f.name), getattr(low.commands, f.name)
         if asked[0] < trained[0] or asked[1] > trained[1]:
             raise ConfigError(
-                f"commands.{f.name} asks for {list(asked)}, but the low level was trained on "
+                f"commands.{f.name} asks for {list(asked)}, but the low policy was trained on "
                 f"{list(trained)}"
             )
+    return high
 
 
 def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
@@ -212,11 +215,11 @@ class NavigationTask:
         guided: int = 0,
         landing: Landing | None = None,
     ) -> None:
-        self.config, self._visual = config, visual
+        self.low, self.low_config = load_low(low)
+        self.config = config = paired(config, self.low_config)
+        self._visual = visual
         self.num_robots = m = num_robots
         self.training = training
-        self.low, self.low_config = load_low(low)
-        check_pair(config, self.low_config)
         self.decoder = CommandDecoder(config.commands, config.action_limit)
         self.rng = np.random.default_rng(seed)
         self.step_seconds = config.decimation * self.low_config.physics.control_dt
@@ -237,7 +240,8 @@ class NavigationTask:
         self._commands = np.zeros((3, m, 15))
         self.stats: dict[str, float] = {}
         families = [config.families[f] for f in self.family]
-        self.teacher = Teacher(self.field, families, landing) if guided else None
+        ranges = self.low_config.commands
+        self.teacher = Teacher(self.field, families, ranges, landing) if guided else None
         self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
