@@ -19,7 +19,7 @@ from tdgc.sim.commands import INDEX
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.tasks.high_env import PRETRAINED, load_low
-from tdgc.tasks.probes import PROBES
+from tdgc.tasks.probes import NUM_PROBES
 
 HIPS = 0.183  # m, of the shipped robot
 
@@ -75,7 +75,7 @@ class Blindfold(HierarchyDriver):
     def command(self, step: int) -> Array:
         def blind(*arguments: Any) -> Any:
             observation = observe(*arguments)
-            observation[:, -len(PROBES) :] = 0.0
+            observation[:, -NUM_PROBES:] = 0.0
             return observation
 
         observe = drivers.observe_high

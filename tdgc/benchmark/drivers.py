@@ -25,7 +25,7 @@ from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.tasks.high_env import SEMANTIC, high_layout, observe_high, paired
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.probes import HeightProbes
+from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.teacher import Teacher, toward
 
 
@@ -152,7 +152,7 @@ class HierarchyDriver:
         self._horizon = round(
             config.episode_seconds / (config.decimation * loco.physics.control_dt)
         )
-        self._probes = HeightProbes(loco, noise)
+        self._probes = HeightProbes(loco, PROBES[config.probes], noise)
         self._probes.begin(np.arange(m))
         self._state: policies.State | None = None
         self._last = np.zeros((m, NUM_ACTIONS))
