@@ -35,7 +35,7 @@ from tdgc.benchmark.evaluation import (
     spread,
 )
 from tdgc.benchmark.recording import Recorder, Recording, Together
-from tdgc.benchmark.results import write_results
+from tdgc.benchmark.results import describe, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, check_installed, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
@@ -219,23 +219,6 @@ def run_one(
     return episodes, recorder.recordings(), diagnoses, chosen
 
 
-def print_table(summary: dict[str, Any]) -> None:
-    """Rates with intervals: a line a family and level, the means below."""
-    for policy, conditions in summary.items():
-        for condition, families in conditions.items():
-            print(f"\n{policy}, {condition}")
-            names = [f for f in families if f != "mean"]
-            levels = list(families[names[0]])
-            wide = max(8, *(len(name) + 1 for name in names))
-            print("family".ljust(wide) + "".join(f"{level:>8}" for level in levels))
-            for name in names:
-                cells = "".join(f"{100 * families[name][lv]['rate']:7.1f}%" for lv in levels)
-                print(name.ljust(wide) + cells)
-            mean = families["mean"]
-            rate, low, high = (100 * mean[key] for key in ("rate", "ci_low", "ci_high"))
-            print(f"{'mean'.ljust(wide)}{rate:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}")
-
-
 def run_tracking(low: Policy, args: argparse.Namespace) -> int:
     share_out = spread if args.cluster is None else cluster.spread
     result = tracking(low, args.episodes, args.seed, args.workers, share_out)
@@ -305,7 +288,7 @@ def run_table(
     plots.gait_shares(args.out, args.out / "gaits.png")
     plots.headings(args.out, args.out / "headings.png")
     plots.trajectories(args.out, args.out / "trajectories.png")
-    print_table(summary)
+    print(describe(summary))
     if traced is not None:
         diagnosis.write(diagnoses, args.out / "diagnosis.csv")
         print(f"\n{diagnosis.describe(diagnoses, episodes)}")
