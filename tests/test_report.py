@@ -156,7 +156,7 @@ def test_paired_differences_and_where_dominance_fails(tmp_path: Path) -> None:
     reader = Reader(report.render(tmp_path))
     assert ["condition", "gap", "mean"] in reader.rows
     # Of ten tiles all are lost: Wilson's 0 to 0.278 and 0.722 to 1, squared and added.
-    lost = "-100.0 below gp -100.0 to -60.7"
+    lost = "-100.0 below gp -100.0 to -60.8"
     assert ["nominal", lost, lost] in reader.rows
     assert ["pushes", *["-100.0 -100.0 to +12.2"] * 2] in reader.rows  # one tile says little
 
