@@ -14,11 +14,13 @@ import dataclasses
 import functools
 import math
 import sys
+from pathlib import Path
 from typing import Any, cast
 
 import torch as th
+from tqdm import tqdm
 
-from tdgc import __version__
+from tdgc import __version__, policies
 from tdgc.config import PRESETS, ConfigError, HighTrainConfig, to_dict
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy
@@ -32,10 +34,26 @@ from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.high_env import NavigationTask, high_mirror, load_low, paired, summarise
+from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_mirror, load_low, paired, summarise
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.teacher import check_styles
+from tdgc.tasks.teacher import STYLES
 from tdgc.tasks.tiles import check_families
+
+#: Where train_low.py leaves its policy by default.
+TRAINED_LOW = Path("runs/low/policy")
+
+
+def find_low() -> str:
+    """The low policy of a finished run of train_low.py, or else the shipped one.
+
+    Raises:
+        PolicyFileError: what the run left cannot be read.
+    """
+    if TRAINED_LOW.with_suffix(".json").exists():
+        if "calibration" in policies.load(TRAINED_LOW).meta:
+            return str(TRAINED_LOW)
+        tqdm.write(f"{TRAINED_LOW} is not calibrated yet, its run has not come to its end")
+    return str(PRETRAINED / "low")
 
 
 def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
@@ -67,6 +85,8 @@ def make_env(
     landing = None
     if guided and "gap" in env_config.families:
         landing = measure_landing(low, probe.low_config)
+        if landing is None:
+            tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
     return TaskVecEnv(
         functools.partial(NavigationTask, env_config, low, guided=guided, landing=landing),
         config.n_envs,
@@ -150,7 +170,9 @@ def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     add_arguments(parser, "runs/high")
-    parser.add_argument("--low", help="low-level policy (the shipped one)")
+    parser.add_argument(
+        "--low", help="low policy (what train_low.py left in runs/low, or else the shipped one)"
+    )
     parser.add_argument(
         "--preset", choices=PRESETS, default="default", help="paper: the paper's hyperparameters"
     )
@@ -162,14 +184,18 @@ def main(arguments: list[str] | None = None) -> int:
         args.assignments.append(f"low={args.low}")
     try:
         config = configure(HighTrainConfig(), args)
-        low, low_config = load_low(config.low)
+        config = dataclasses.replace(config, low=config.low or find_low())
+        low, low_config = load_low(cast(str, config.low))
+        tqdm.write(f"low policy: {config.low}")
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check_families(config.env.families)
         unknown = config.env.unknown_share
         if not 0.0 <= unknown <= 1.0:
             raise ConfigError(f"'env.unknown_share' must be from 0 to 1, not {unknown:g}")
         if config.imitation.steps:
-            check_styles(config.env.families)
+            for family in config.env.families:
+                if family not in STYLES:
+                    tqdm.write(f"the teacher knows no style for {family} and walks straight on")
         meta: dict[str, Any] = {
             "config": to_dict(config.env),
             "low": {"config": to_dict(low_config), "observation": low.actor_dim},

@@ -44,7 +44,7 @@ from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
 from tdgc.sim.robot import NUM_JOINTS
-from tdgc.tasks.high_env import NavigationTask
+from tdgc.tasks.high_env import PRETRAINED, NavigationTask
 from tdgc.tasks.low_env import LowLevelTask
 
 _COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
@@ -277,7 +277,7 @@ def compare_loads(seconds: float) -> dict[str, Any]:
 def compare_updates(updates: int) -> dict[str, float]:
     """update.json: ``update_seconds`` on the default configuration."""
     config = HighTrainConfig()
-    probe = NavigationTask(config.env, config.low, 1, seed=0)
+    probe = NavigationTask(config.env, PRETRAINED / "low", 1, seed=0)
     spaces = probe.observation_space, probe.action_space
     probe.close()
     result = update_seconds(config, spaces, updates)

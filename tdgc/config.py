@@ -368,7 +368,8 @@ class HighTrainConfig:
     log_steps: int = 24_000
     checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
     start_speed: float = 0.5  # m/s: before any training it walks straight on in the default gait
-    low: str = "tdgc/pretrained/low"
+    # The low policy: by default what train_low.py left in runs/low, or else the shipped one.
+    low: str | None = None
     env: HighLevelConfig = field(default_factory=HighLevelConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     ppo: RecurrentPPOConfig = field(default_factory=RecurrentPPOConfig)

@@ -9,8 +9,8 @@ from tdgc.config import CommandRanges, PhysicsConfig, RobotConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.terrain import Features, TileField, make_tile
-from tdgc.tasks.leaps import SWING_HEIGHT
-from tdgc.tasks.teacher import STYLES, Teacher, travel_cost
+from tdgc.tasks.leaps import SWING_HEIGHT, Landing
+from tdgc.tasks.teacher import PLAIN, STYLES, Teacher, travel_cost
 
 
 def test_travel_cost_in_the_open_is_the_way_of_a_king() -> None:
@@ -42,7 +42,7 @@ class Course:
         self.origin = self.field.origin(np.arange(len(families)), 0)
         self.loco = Locomotion(len(families), RobotConfig(), PhysicsConfig(), self.field)
         self.goal = self.origin + [7.25, 4.0]
-        self.teacher = Teacher(self.field, families, CommandRanges())
+        self.teacher = Teacher(self.field, families, CommandRanges(), Landing())
 
     def put(self, x: float, y: float = 4.0, yaw: float = 0.0) -> None:
         m = len(self.origin)
@@ -119,9 +119,18 @@ def test_goes_around_a_pillar(course) -> None:
     assert abs(course.commands()[0, INDEX["yaw_rate"]]) < 0.2
 
 
-def test_a_family_without_a_style_is_refused() -> None:
-    with pytest.raises(
-        ValueError,
-        match=r"does not know mixed, only rough, .*; imitation\.steps=0 does without it$",
-    ):
-        Teacher(TileField((1, 1)), ["mixed"], CommandRanges())
+def test_a_family_without_a_style_is_walked_straight_on(course) -> None:
+    course = course(["mixed"])
+    course.put(1.0)
+    command = course.commands()[0]
+    assert command[INDEX["vx"]] == pytest.approx(PLAIN.speed) and gait_index(command) == 0
+    assert command[INDEX["swing_height"]] == PLAIN.swing_height
+
+
+def test_a_policy_that_does_not_leap_walks_over_trenches(course) -> None:
+    course = course(["gap"])
+    course.teacher = Teacher(course.field, ["gap"], CommandRanges(), None)
+    course.teacher.begin(np.arange(1), course.goal)
+    course.put(1.7)
+    command = course.commands()[0]
+    assert command[INDEX["vx"]] == pytest.approx(PLAIN.speed) and gait_index(command) == 0

@@ -39,6 +39,7 @@ from tdgc.learn.run import Interruption, append_line
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
+from tdgc.tasks.high_env import PRETRAINED
 from tdgc.tasks.low_env import LowLevelTask
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -528,7 +529,6 @@ def test_flags_and_folders_that_cannot_be_used(
         assert error.startswith("train_low.py: ") and message in error
         assert error.count("\n") == 1
     for setting, message in (
-        ('env.families=["mixed"]', "the teacher does not know mixed, only rough, "),
         ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
         ("env.unknown_share=1.5", "'env.unknown_share' must be from 0 to 1, not 1.5"),
         ("env.unknown_share=-0.1", "'env.unknown_share' must be from 0 to 1, not -0.1"),
@@ -555,6 +555,24 @@ def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "config.json").write_text(begun, encoding="utf-8")
     assert workers("--resume", "--workers", "auto") == workers("--resume") == 7
     assert workers("--resume", "--workers", "5") == 5
+
+
+def test_the_low_policy_is_what_the_first_command_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Once it is calibrated; the shipped one until then."""
+    shipped = str(PRETRAINED / "low")
+    low = policies.load(shipped)
+    monkeypatch.chdir(tmp_path)
+    assert train_high.find_low() == shipped
+    left = {key: value for key, value in low.meta.items() if key != "calibration"}
+    policies.save_copy(tmp_path / "runs" / "low" / "policy", low, {}, left)
+    assert train_high.find_low() == shipped
+    assert "runs/low/policy is not calibrated yet" in "".join(capsys.readouterr())
+    policies.save_copy(
+        tmp_path / "runs" / "low" / "policy", low, {}, {**left, "calibration": {"robots": 64}}
+    )
+    assert train_high.find_low() == "runs/low/policy"
 
 
 def test_robots_of_a_run() -> None:

@@ -161,17 +161,18 @@ def leap_command(command: Array, frequency: ArrayLike, length: ArrayLike) -> Non
 
 _ROBOTS = 16  # that a landing is measured with: a few millimetres between two such measurements
 _SECONDS, _SETTLE = 6.0, 1.5  # s, of the measurement, and how much of it speeding up takes
+_STANDING = 0.5  # share of the robots that are still up after the measurement, where leaps work
 _RATE = 0.02  # of a landing in the measurement: after 180 of them 3 % of the start is left
 
 
-def measure_landing(low: Policy, config: LowLevelConfig) -> Landing:
+def measure_landing(low: Policy, config: LowLevelConfig) -> Landing | None:
     """Where ``low`` lands when it leaps along a plane, with strides of 0.30 to 0.46 m.
 
     Args:
         low: the low policy, of ``config``.
 
     Returns:
-        The landing; the first edition's where no robot stays up: such a policy cannot leap.
+        The landing; None for a policy that cannot leap: most robots have fallen.
     """
     loco = Locomotion(_ROBOTS, config.robot, config.physics, None, config.gyro)
     rows, dt = np.arange(_ROBOTS), config.physics.control_dt
@@ -181,7 +182,7 @@ def measure_landing(low: Policy, config: LowLevelConfig) -> Landing:
     leap_command(loco.command, np.clip(SPEED / stride, *config.commands.frequency), length)
     places = np.column_stack([np.zeros(_ROBOTS), 2.0 * rows])
     loco.place(rows, places, np.zeros(_ROBOTS), np.linspace(0.0, 1.0, _ROBOTS, endpoint=False))
-    landing = Landing()
+    landing, up = Landing(), rows
     try:
         for step in range(round(_SECONDS / dt)):
             state = loco.world.state
@@ -193,4 +194,4 @@ def measure_landing(low: Policy, config: LowLevelConfig) -> Landing:
                 landing.learn(loco, up, before[up], _RATE)
     finally:
         loco.world.close()
-    return landing
+    return landing if up.size >= _STANDING * _ROBOTS else None

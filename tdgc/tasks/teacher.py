@@ -41,6 +41,8 @@ STYLES = {
     "gap": Style(SPEED),  # in pronk, see ``tdgc.tasks.leaps``
     "tilt": Style(0.6, frequency=3.5, swing_height=0.2),
 }
+#: Of families that have none: straight on with high feet, as ``gp`` walks.
+PLAIN = Style(0.6, swing_height=0.2)
 _BEYOND = 0.5  # m behind the last trench, where leaping ends
 _LEAP_TURN = 1.5  # 1/s, yaw rate per rad that a leap is off its heading; as in ``toward``
 
@@ -111,20 +113,6 @@ def travel_cost(pillars: Array, width: int, left: float, goal: Array) -> tuple[A
             return cost[inside].copy(), step, left
 
 
-def check_styles(families: Sequence[str]) -> None:
-    """See that there is a style for each of the families.
-
-    Raises:
-        ValueError: there is none for one of them.
-    """
-    for family in families:
-        if family not in STYLES:
-            raise ValueError(
-                f"the teacher does not know {family}, only {', '.join(STYLES)}; "
-                "imitation.steps=0 does without it"
-            )
-
-
 class Teacher:
     """Commands robots on tiles of their own.
 
@@ -132,10 +120,7 @@ class Teacher:
         field: (M, 1) tiles.
         families: of the robots, (M,) names.
         ranges: of the commands that their low policy was trained on.
-        landing: of the low policy.
-
-    Raises:
-        ValueError: a family it has no style for.
+        landing: of the low policy; None for one that does not leap, which walks over trenches.
     """
 
     def __init__(
@@ -143,15 +128,17 @@ class Teacher:
         field: TileField,
         families: Sequence[str],
         ranges: CommandRanges,
-        landing: Landing | None = None,
+        landing: Landing | None,
     ) -> None:
-        check_styles(families)
         m = len(families)
-        self._field, self._ranges, self._landing = field, ranges, landing or Landing()
+        self._field, self._ranges, self._landing = field, ranges, landing
         self._origin = field.origin(np.arange(m), 0)
-        self._leaps = np.array([family == "gap" for family in families])
+        self._leaps = np.array([family == "gap" and landing is not None for family in families])
         self._pillars = np.array([family == "pillar" for family in families])
-        styles = [STYLES[family] for family in families]
+        styles = [
+            PLAIN if family == "gap" and landing is None else STYLES.get(family, PLAIN)
+            for family in families
+        ]
         self._command = np.tile(default_command(), (m, 1))
         for name in ("frequency", "swing_height", "stance_width"):
             self._command[:, INDEX[name]] = [getattr(style, name) for style in styles]
@@ -165,6 +152,7 @@ class Teacher:
         width = self._field.heights.shape[1]
         for i in index[self._leaps[index]]:
             trenches = self._field.features[int(i), 0].trenches
+            assert self._landing is not None  # or nobody leaps
             self._plan.look(int(i), trenches, self._landing.spread)
             self._end[i] = trenches[-1, 1] + _BEYOND
         for i in index[self._pillars[index]]:
@@ -186,7 +174,7 @@ class Teacher:
         speed, turn = toward(distance, error, self._speed, turns=self._ranges.yaw_rate)
         command[:, INDEX["vx"]], command[:, INDEX["yaw_rate"]] = speed, turn
         rows = np.flatnonzero(self._leaps & (local[:, 0] < self._end))
-        if rows.size:
+        if rows.size and self._landing is not None:
             # Facing across the trenches both feet of a pair land on one line; sideways to the goal.
             leaps, fast = command[rows], self._speed[rows]
             leaps[:, INDEX["vx"]] = fast * np.cos(bearing[rows])
