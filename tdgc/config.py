@@ -248,6 +248,8 @@ class HighLevelConfig:
 
     decimation: int = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
     cues: Literal["both", "semantic", "geometric", "none"] = "both"
+    # Where the heights of the geometric cue are probed, see ``tdgc.tasks.probes``.
+    probes: Literal["lines", "staggered"] = field(default="lines", metadata={"before": "staggered"})
     # Share of the robots in training that are told an unknown family, so that the probes alone have
     # to do: tiles of several families, or of none that has a name.
     unknown_share: float = 0.2
@@ -259,7 +261,8 @@ class HighLevelConfig:
     episode_seconds: float = 20.0  # T_max (benchmark)
     hold_seconds: float = 2.0  # an episode goes on that long after the goal was reached
     action_limit: float = 1.0  # a_max of the decoder
-    commands: CommandRanges = field(default_factory=CommandRanges)  # the decoder's bounds
+    # The decoder's bounds; all that the low policy was trained on where there are none.
+    commands: CommandRanges | None = None
     rewards: HighRewardConfig = field(default_factory=HighRewardConfig)
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
@@ -340,6 +343,7 @@ class RecurrentPPOConfig:
     initial_gait_std: float = 0.08
     # With 128 units each an update takes twice as long, and what is learned is no better.
     lstm: int = 64
+    mirror: bool = True  # policy and value exactly left-right symmetric
     actor: tuple[int, ...] = (64,)
     critic: tuple[int, ...] = (64,)
 
@@ -392,6 +396,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
         "ppo.n_epochs=5",
         "ppo.minibatches=4",
         "ppo.lstm=128",
+        "ppo.mirror=false",
         "ppo.actor=[128]",
         "ppo.critic=[128]",
         "env.unknown_share=0",
@@ -518,6 +523,10 @@ def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
         raise ConfigError(f"unknown configuration key '{full}'; allowed: {', '.join(names)}")
     child = getattr(config, head)
     if rest:
+        if child is None:  # a table that may be left out
+            options = typing.get_args(typing.get_type_hints(type(config))[head])
+            table = next((o for o in options if dataclasses.is_dataclass(o)), None)
+            child = None if table is None else typing.cast(type, table)()
         if not dataclasses.is_dataclass(child):
             raise ConfigError(f"'{full}': '{head}' is a value, it has no keys of its own")
         return dataclasses.replace(config, **{head: _replace(child, rest, value, full)})

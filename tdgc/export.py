@@ -71,7 +71,7 @@ from tdgc.tasks.high_env import (
     load_low,
     observe_high,
 )
-from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
+from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rules import GOING, outcome
 
 #: Formats and the endings of their files.
@@ -321,7 +321,7 @@ class HighLevel(nn.Module):
         )
         cues = {
             "family": Signal("family", len(SEMANTIC), "1", family, "families"),
-            "probes": Signal("probes", len(PROBES), "m", probes, "probes"),
+            "probes": Signal("probes", NUM_PROBES, "m", probes, "probes"),
         }
         self.inputs = [
             Signal("goal", 2, "m", "ahead and to the left in the frame that turns by yaw alone"),
@@ -438,10 +438,10 @@ def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, dict[str
         "rate_hz": 1.0 / (decimation * physics.control_dt),
         "control_steps": decimation,
         "joints": JOINTS,
-        "commands": _commands(pair.high_config.commands),
+        "commands": _commands(pair.high_config.commands or pair.low_config.commands),
         "decision": (*CONTINUOUS, "gait"),
         "families": SEMANTIC,
-        "probes": {"unit": "m", "ahead_left": PROBES.tolist()},
+        "probes": {"unit": "m", "ahead_left": PROBES[pair.high_config.probes].tolist()},
     }
     return {"low": low_table, "high": high_table}
 
@@ -660,7 +660,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
                 task.decoder.normalise(last),
                 task.family_index,
                 config.cues,
-                height_probes(loco),
+                height_probes(loco, PROBES[config.probes]),
             )
             last, state = pair.high.predict(seen, state)
             made = decide(_sense(task) | {"clock": walk.memory["clock"]})
@@ -693,7 +693,7 @@ def _sense(task: NavigationTask) -> dict[str, Array]:
         "goal": np.array([[ahead, left], [-left, ahead]]) @ offset,
         "time_left": (task.horizon - task.elapsed) * task.step_seconds,
         "family": np.eye(len(SEMANTIC))[task.family_index[0]],
-        "probes": height_probes(loco)[0],
+        "probes": height_probes(loco, PROBES[task.config.probes])[0],
     }
 
 

@@ -27,7 +27,7 @@ from tdgc.sim.commands import INDEX
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.tasks.high_env import PRETRAINED, load_low
-from tdgc.tasks.probes import PROBES
+from tdgc.tasks.probes import NUM_PROBES
 
 HIPS = 0.183  # m, of the shipped robot
 
@@ -83,7 +83,7 @@ class Blindfold(HierarchyDriver):
     def command(self, step: int) -> Array:
         def blind(*arguments: Any) -> Any:
             observation = observe(*arguments)
-            observation[:, -len(PROBES) :] = 0.0
+            observation[:, -NUM_PROBES:] = 0.0
             return observation
 
         observe = drivers.observe_high
@@ -208,7 +208,7 @@ def test_who_walks_blindly_into_a_trench_made_no_decision():
     """Where nothing looked at the ground; whoever has seen the trench is judged as elsewhere."""
     lip = float(tile_of(0, "gap", 6, 0).features.trenches[0, 0])
     at_lip = ((lip - 1.5, 4.0), (lip - HIPS, 4.0))
-    blind = {f"probe_{i:02d}": np.nan for i in range(len(PROBES))}
+    blind = {f"probe_{i:02d}": np.nan for i in range(NUM_PROBES)}
     for outcome in ("fell", "collided", "timeout"):
         seen = walk("gap", outcome=outcome, track=at_lip, error_vx=-0.5)
         assert verdict(seen) == ("execution", "lost track of velocity")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.config import CommandRanges, PhysicsConfig, RobotConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.terrain import Features, TileField, make_tile
@@ -42,7 +42,7 @@ class Course:
         self.origin = self.field.origin(np.arange(len(families)), 0)
         self.loco = Locomotion(len(families), RobotConfig(), PhysicsConfig(), self.field)
         self.goal = self.origin + [7.25, 4.0]
-        self.teacher = Teacher(self.field, families)
+        self.teacher = Teacher(self.field, families, CommandRanges())
 
     def put(self, x: float, y: float = 4.0, yaw: float = 0.0) -> None:
         m = len(self.origin)
@@ -124,4 +124,4 @@ def test_a_family_without_a_style_is_refused() -> None:
         ValueError,
         match=r"does not know mixed, only rough, .*; imitation\.steps=0 does without it$",
     ):
-        Teacher(TileField((1, 1)), ["mixed"])
+        Teacher(TileField((1, 1)), ["mixed"], CommandRanges())

@@ -27,7 +27,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
 from tdgc.tasks.high_env import PRETRAINED, load_low
-from tdgc.tasks.probes import height_probes
+from tdgc.tasks.probes import PROBES, height_probes
 
 ROOT = Path(__file__).resolve().parents[1]
 HOLD = 5  # control steps a decision
@@ -39,7 +39,7 @@ class Notes(Tracer):
     def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
         super().begin(cell, loco, field, goal)
         self.goal, self.seen = goal, [self._note(loco)]
-        self.probes = height_probes(loco)
+        self.probes = height_probes(loco, PROBES["lines"])
 
     def step(self, step: int, live: Any, outcome: Any) -> None:
         super().step(step, live, outcome)
@@ -56,7 +56,7 @@ class Notes(Tracer):
             "turn": s.ang_vel[:, 2].copy(),
             "touch": s.foot_force > 1.0,
             "wanted": loco.clock.contact > 0.5,
-            "probes": height_probes(loco),
+            "probes": height_probes(loco, PROBES["lines"]),
             "power": np.abs(s.torque * s.qd).sum(axis=1),
             "force": np.column_stack([s.trunk_force, s.leg_force]),
             "command": loco.command.copy(),

@@ -23,9 +23,9 @@ from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_comman
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
-from tdgc.tasks.high_env import SEMANTIC, check_pair, high_layout, observe_high
+from tdgc.tasks.high_env import SEMANTIC, high_layout, observe_high, paired
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.probes import HeightProbes
+from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.teacher import Teacher, toward
 
 
@@ -118,7 +118,7 @@ class TeacherDriver:
     def __init__(self, low: Policy, config: LowLevelConfig) -> None:
         self.config = HighLevelConfig(cues="none")
         self._landing = measure_landing(low, config)
-        self.bounds = CommandRanges()
+        self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
         self.told: str | None = None
         self.probes: Array | None = None
@@ -127,7 +127,7 @@ class TeacherDriver:
         self._loco, self._goal = loco, goal
         assert loco.world.field is not None  # episodes run on tiles
         families = [family] * loco.num_robots
-        self._teacher = Teacher(loco.world.field, families, self._landing)
+        self._teacher = Teacher(loco.world.field, families, self.bounds, self._landing)
         self._teacher.begin(np.arange(loco.num_robots), goal)
 
     def command(self, step: int) -> Array:
@@ -147,6 +147,7 @@ class HierarchyDriver:
 
     def __init__(self, high: Policy, config: HighLevelConfig) -> None:
         self._high, self.config = high, config
+        assert config.commands is not None  # filled in by ``load_high``
         self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
         self.told: str | None = None
@@ -163,7 +164,7 @@ class HierarchyDriver:
         )
         if config.cues in ("both", "semantic"):
             self.told = SEMANTIC[seen]
-        self._sensor = HeightProbes(loco, noise)
+        self._sensor = HeightProbes(loco, PROBES[config.probes], noise)
         self._sensor.begin(np.arange(m))
         self._state: policies.State | None = None
         self._last = np.zeros((m, NUM_ACTIONS))
@@ -228,5 +229,4 @@ def load_high(
     ):
         if wanted != given:
             raise ConfigError(f"{path}: trained for {what.format(wanted)}, not {given}")
-    check_pair(config, low_config)
-    return high, config
+    return high, paired(config, low_config)

@@ -39,7 +39,7 @@ from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import TileField
 from tdgc.tasks import rewards
 from tdgc.tasks.high_env import command_share, high_step
-from tdgc.tasks.probes import PROBES
+from tdgc.tasks.probes import NUM_PROBES, PROBES
 from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
 from tdgc.tasks.rules import OUTCOMES
 
@@ -65,7 +65,7 @@ TRACKED = ("vx", "vy", "yaw_rate", "body_height", "pitch", "roll")
 _ACTIONS = tuple(f"action_{name}" for name in (*CONTINUOUS, "gait"))
 _COMMANDS = tuple(f"command_{name}" for name in NAMES)
 _AT_BOUND = tuple(f"at_bound_{name}" for name in CONTINUOUS)
-_PROBES = tuple(f"probe_{i:02d}" for i in range(len(PROBES)))
+_PROBES = tuple(f"probe_{i:02d}" for i in range(NUM_PROBES))
 _REWARDS = tuple(f"reward_{name}" for name in HIGH_TERMS)
 
 
@@ -81,7 +81,7 @@ def _columns() -> Iterator[Column]:
     yield Column("goal_distance", "m", "from the trunk to the goal")
     yield Column("goal_bearing", "rad", "of the goal against the heading, to the left positive")
     yield Column("family", "", "cue: the terrain family that the high level was told")
-    for name, (x, y) in zip(_PROBES, PROBES, strict=True):
+    for name, (x, y) in zip(_PROBES, PROBES["lines"], strict=True):
         where = f"({x:g}, {y:g}) m ahead and to the left"
         yield Column(name, "m", f"cue: ground {where}, against where a standing robot's would be")
     for name in _ACTIONS:

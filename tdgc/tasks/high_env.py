@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 
 from tdgc import policies
 from tdgc.config import (
+    CommandRanges,
     ConfigError,
     HighLevelConfig,
     HighRewardConfig,
     LowLevelConfig,
     recorded,
 )
-from tdgc.policies import Policy
-from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, gait_index
+from tdgc.policies import Mirror, Policy
+from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, CommandDecoder, gait_index
 from tdgc.sim.gaits import GAITS
-from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
+from tdgc.sim.locomotion import MIRRORS, SPEED_SCALE, Locomotion, mirror_map
 from tdgc.sim.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import FAMILIES, draw_start_goal
@@ -35,7 +36,13 @@ from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.low_env import TaskEnv
-from tdgc.tasks.probes import PROBE_RANGE, PROBES, HeightProbes
+from tdgc.tasks.probes import (
+    NUM_PROBES,
+    PROBE_RANGE,
+    PROBE_SWAP,
+    PROBES,
+    HeightProbes,
+)
 from tdgc.tasks.rules import REACHED, has_failed, outcome
 from tdgc.tasks.teacher import Teacher
 from tdgc.tasks.tiles import TrainingTiles
@@ -64,8 +71,45 @@ def high_layout(cues: str) -> tuple[tuple[str, int], ...]:
     if cues in ("both", "semantic"):
         layout.append(("family", len(SEMANTIC)))
     if cues in ("both", "geometric"):
-        layout.append(("probes", len(PROBES)))
+        layout.append(("probes", NUM_PROBES))
     return tuple(layout)
+
+
+_ACTION_SIGN = tuple(
+    -1.0 if name in ("vy", "yaw_rate", "roll") else 1.0 for name in (*CONTINUOUS, "gait")
+)
+#: How each part of ``high_layout`` looks in a left-right mirror: (source index, sign).
+_MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
+    **MIRRORS,
+    "goal": ((0, 1, 2), (1.0, 1.0, -1.0)),
+    "time_left": ((0,), (1.0,)),
+    "last_action": (tuple(range(NUM_ACTIONS)), _ACTION_SIGN),
+    "family": (tuple(range(len(SEMANTIC))), (1.0,) * len(SEMANTIC)),
+    "probes": (PROBE_SWAP, (1.0,) * NUM_PROBES),
+}
+
+
+def high_mirror(config: HighLevelConfig) -> Mirror:
+    """Left-right mirror of the high policy's observations and actions.
+
+    Raises:
+        ConfigError: probes or bounds to one side that are not those to the other.
+    """
+    if config.probes != "lines":
+        raise ConfigError(
+            f"probes that are {config.probes} are not the same on both sides, as a symmetric "
+            "policy needs them; ppo.mirror=false does without symmetry"
+        )
+    for name in ("vy", "yaw_rate", "roll"):
+        low, high = getattr(config.commands or CommandRanges(), name)
+        if low != -high:
+            raise ConfigError(
+                f"commands.{name} must be the same to both sides for a symmetric policy, not "
+                f"{[low, high]}; ppo.mirror=false does without symmetry"
+            )
+    index, sign = mirror_map(high_layout(config.cues), _MIRRORS)
+    actions = tuple(range(NUM_ACTIONS))
+    return Mirror(tuple(index.tolist()), tuple(sign.tolist()), actions, _ACTION_SIGN)
 
 
 def observe_high(
@@ -153,19 +197,22 @@ def high_step(
     )
 
 
-def check_pair(high: HighLevelConfig, low: LowLevelConfig) -> None:
-    """Refuse decoder bounds that the low level was not trained on.
+def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
+    """The MDP of a high policy on a low policy: with the decoder's bounds, if it has none.
 
     Raises:
-        ConfigError: names the command and both ranges.
+        ConfigError: bounds that the low policy was not trained on; names the command and both.
     """
+    if high.commands is None:
+        return dataclasses.replace(high, commands=low.commands)
     for f in dataclasses.fields(low.commands):
         asked, trained = getattr(high.commands, f.name), getattr(low.commands, f.name)
         if asked[0] < trained[0] or asked[1] > trained[1]:
             raise ConfigError(
-                f"commands.{f.name} asks for {list(asked)}, but the low level was trained on "
+                f"commands.{f.name} asks for {list(asked)}, but the low policy was trained on "
                 f"{list(trained)}"
             )
+    return high
 
 
 def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
@@ -212,11 +259,11 @@ class NavigationTask:
         guided: int = 0,
         landing: Landing | None = None,
     ) -> None:
-        self.config, self._visual = config, visual
+        self.low, self.low_config = load_low(low)
+        self.config = config = paired(config, self.low_config)
+        self._visual = visual
         self.num_robots = m = num_robots
         self.training = training
-        self.low, self.low_config = load_low(low)
-        check_pair(config, self.low_config)
         self.decoder = CommandDecoder(config.commands, config.action_limit)
         self.rng = np.random.default_rng(seed)
         self.step_seconds = config.decimation * self.low_config.physics.control_dt
@@ -237,7 +284,8 @@ class NavigationTask:
         self._commands = np.zeros((3, m, 15))
         self.stats: dict[str, float] = {}
         families = [config.families[f] for f in self.family]
-        self.teacher = Teacher(self.field, families, landing) if guided else None
+        ranges = self.low_config.commands
+        self.teacher = Teacher(self.field, families, ranges, landing) if guided else None
         self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
@@ -255,7 +303,7 @@ class NavigationTask:
         noise = Noise(self.config.randomisation, self.rng) if self.training else None
         self.locomotion = Locomotion(m, c.robot, c.physics, self.field, c.gyro, self._visual)
         self._executor = Executor(self.locomotion, self.low, noise)
-        self._probes = HeightProbes(self.locomotion, noise)
+        self._probes = HeightProbes(self.locomotion, PROBES[self.config.probes], noise)
 
     # ------------------------------------------------------------------ episodes
 
@@ -345,8 +393,9 @@ class NavigationTask:
         done = np.flatnonzero(failed | truncated)
         self._count(terms, reward, commands, done, reached)
         if self.training:
-            if done.size:
-                self.curriculum.push(done, reached[done])
+            own = done[~self._led[done]]  # the teacher's episodes say nothing of the policy
+            if own.size:
+                self.curriculum.push(own, reached[own])
             self._push()
         return reward, failed, truncated
 
