@@ -24,7 +24,9 @@ from tdgc.tasks.teacher import STYLES, Style, toward
 #: How to walk where no family is told: what rough ground, stairs and slopes have in common.
 UNKNOWN = Style(0.6, frequency=3.2, swing_height=0.2, stance_width=0.33)
 
-_DEEP = -0.12  # m below the ground around: a trench; Rough ends at 0.12 m
+# m below the ground around: a trench, half way down its walls. Planned from lip to lip 26 of 100
+# robots got over level 10, like this 54.
+_DEEP = -0.3
 _TALL = 0.35  # m above it: a pillar, as far as no stairs are about
 _GROUND = 0.3  # m, what is further from the standing height is not the ground around
 _BEYOND = 0.5  # m behind the last trench, where leaping ends; as for the teacher
@@ -101,6 +103,8 @@ class CuesLaw:
         self._look(state, cue)
         state.command = self._walk(state, distance, bearing)
         self._leap(state, bearing)
+        # A low policy may have been trained on less than the styles ask for.
+        state.command = np.clip(state.command, self._decoder.low, self._decoder.high)
         return self._decoder.encode(state.command), state
 
     def _look(self, memory: Memory, cue: dict[str, Array]) -> None:
@@ -114,15 +118,18 @@ class CuesLaw:
         height = probes - ground[:, None]
         line = height[:, self._ahead]
         jump = line[:, 2:] - line[:, :-2]  # over 10 cm, where a stair has one step at most
-        memory.gap |= memory.unknown & (jump < -_TALL).any(axis=1)
-        memory.pillar |= memory.unknown & (jump > _TALL).any(axis=1)
+        far = line[:, 2:]
+        trench = (jump < -_TALL) & (far < -_TALL)
+        pillar = (jump > _TALL) & (far > _TALL)
+        memory.gap |= memory.unknown & trench.any(axis=1)
+        memory.pillar |= memory.unknown & pillar.any(axis=1)
         places = memory.where.points(self._points)
         before = places if memory.places is None else memory.places
         memory.places = places
         for profile, seen in zip(memory.profiles, (places, before), strict=True):
             profile.add(seen[..., 0], (height < _DEEP) & memory.gap[:, None], self._ahead)
         late = memory.delay.late()
-        for i in np.flatnonzero(memory.pillar):
+        for i in np.flatnonzero(memory.pillar).tolist():
             seen = before if late[i] else places
             memory.obstacles.add(i, seen[0, i, height[i] > _TALL])
 
@@ -135,7 +142,7 @@ class CuesLaw:
         fast = np.array([style.speed for style in styles])
         fast[memory.pillar] = STYLES["pillar"].speed
         error, goal = bearing.copy(), np.array([GOAL_X, 0.0])
-        for i in np.flatnonzero(memory.pillar):
+        for i in np.flatnonzero(memory.pillar).tolist():
             heading, at = memory.where.heading[0, i], memory.where.position[0, i]
             way = memory.obstacles.direction(i, at, goal, heading + bearing[i])
             error[i] = wrap_angle(way - heading)
@@ -147,16 +154,17 @@ class CuesLaw:
         """Turn the commands of robots that have trenches before them into those of leaps."""
         late = memory.delay.late().astype(int)
         track = np.choose(late, [profile.track() for profile in memory.profiles])
-        chosen = np.maximum(track, 0), np.arange(len(track))
+        tracks = np.maximum(track, 0).tolist()
+        chosen = tracks, np.arange(len(tracks))
         heading, x = memory.where.heading[chosen], memory.where.position[chosen][:, 0]
         # Half way between the tracks while they cannot be told apart.
         heading = np.where(track < 0, memory.where.heading.mean(axis=0), heading)
         speed, memory.x = (x - memory.x) / self._dt, x
         leaping = []
-        for i in np.flatnonzero(memory.gap):
+        for i in np.flatnonzero(memory.gap).tolist():
             profile = memory.profiles[late[i]]
-            lips = profile.trenches(i, int(chosen[0][i]), _WIDEST)
-            done = memory.unknown[i] or profile.seen(i, int(chosen[0][i])) > ZONE[1]
+            lips = profile.trenches(i, tracks[i], _WIDEST)
+            done = memory.unknown[i] or profile.seen(i, tracks[i]) > ZONE[1]
             if done and x[i] > lips.max(initial=0.0) + _BEYOND:
                 continue
             if not np.array_equal(lips, memory.planned[i]):

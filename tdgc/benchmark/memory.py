@@ -1,4 +1,4 @@
-"""What a script may remember of the high policy's cues: where it is, when its feet land, what it saw.
+"""What a script may remember of the high policy's cues: where it is, what it saw.
 
 The high policy has a recurrent state for that.
 """
@@ -13,6 +13,7 @@ from tdgc.sim.commands import INDEX, gait_index
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, wrap_angle
 from tdgc.sim.terrain import GOAL_X, START_X, TILE_SIZE
+from tdgc.tasks.rules import GOAL_RADIUS
 
 
 class Reckoning:
@@ -41,7 +42,8 @@ class Reckoning:
         """Go on to the goal cue ``dt`` s later, ``velocity`` (M, 2) m/s in the heading frame having
         been commanded meanwhile."""
         sideways = velocity[:, 1] * np.cos(self._bearing) - velocity[:, 0] * np.sin(self._bearing)
-        turned = wrap_angle(bearing - self._bearing) + dt * sideways / np.maximum(distance, 0.5)
+        near = np.maximum(distance, GOAL_RADIUS)  # nearer the bearing says nothing
+        turned = wrap_angle(bearing - self._bearing) + dt * sideways / near
         self.heading = wrap_angle(self.heading - turned)
         self._bearing = bearing
         self._place(distance, bearing)
@@ -86,7 +88,7 @@ class Delay:
         self._before = now
 
     def late(self) -> NDArray[np.bool_]:
-        """(M,)"""
+        """Whether what the joints said a decision ago explains the probes better, (M,)."""
         return self._off[1] < self._off[0]
 
 
@@ -98,7 +100,7 @@ class Profile:
 
     _BIN = 0.01  # m, of the line ahead, from which lips are found
     _WIDE = 0.05  # m, of all probes, by which tracks are told apart
-    _SURE = 2.0  # disagreeing probes more, with which a track is ruled out
+    _SURE = 2.0  # disagreeing probes more that rule a track out: a lip alone makes one or two
 
     def __init__(self, num_robots: int) -> None:
         size = round((TILE_SIZE + 2.0) / self._BIN)
@@ -172,15 +174,13 @@ class Clock:
         self._doubtful = False
         now = self._either(signal)
         off = np.array([[_apart(a + run, b) for b in now] for a in before])
-        self.now = np.mod(now[1], 1.0)
-        first = off[:, 0].min(axis=0) <= off[:, 1].min(axis=0)
-        self.now[first] = np.mod(now[0], 1.0)[first]
+        self.now = np.choose(off.min(axis=0).argmin(axis=0), now)
 
     @staticmethod
     def _either(signal: Array) -> tuple[Array, Array]:
         """The two clocks that give the cue: in trot and pronk the right front foot's phase."""
         first = np.arcsin(np.clip(signal[:, 1], -1.0, 1.0)) / (2.0 * np.pi)
-        return first, 0.5 - first
+        return np.mod(first, 1.0), np.mod(0.5 - first, 1.0)
 
 
 def _apart(a: Array, b: Array) -> Array:
@@ -199,7 +199,8 @@ class Obstacles:
     _STEP, _HALF = 0.1, 12  # m and cells: the window is 2.5 m wide
     _RADIUS, _WIDE = 0.28, 0.5  # m from a pillar: blocked within, free beyond; as for the teacher
     _BLOCKED, _CLOSE = 30.0, 3.0  # cost of a metre inside the radius and at it; 1 in the open
-    _LOOK = 0.35  # m ahead, where the lowest cost is looked for
+    _LOOK = 0.35  # m ahead, where the lowest cost is looked for; as for the teacher
+    _AHEAD = 0.02  # m per rad, so that near ties go to the straight way
     _RAYS = np.linspace(-np.pi, np.pi, 48, endpoint=False)
 
     def __init__(self, num_robots: int) -> None:
@@ -231,7 +232,8 @@ class Obstacles:
         cost = _settle(cost, self._STEP * price)
         rays = np.stack([np.cos(self._RAYS), np.sin(self._RAYS)], axis=-1)
         value = _between(cost, self._HALF + self._LOOK / self._STEP * rays)
-        return float(self._RAYS[(value + 0.02 * np.abs(wrap_angle(self._RAYS - ahead))).argmin()])
+        value += self._AHEAD * np.abs(wrap_angle(self._RAYS - ahead))
+        return float(self._RAYS[value.argmin()])
 
 
 def _settle(cost: Array, price: Array) -> Array:
