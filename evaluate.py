@@ -24,6 +24,7 @@ from typing import Any, Literal
 from tqdm import tqdm
 
 from tdgc.benchmark import diagnosis, tuning
+from tdgc.benchmark.cues import CuesLaw
 from tdgc.benchmark.diagnosis import Diagnosis, diagnose
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
 from tdgc.benchmark.evaluation import (
@@ -42,7 +43,7 @@ from tdgc.benchmark.results import describe, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, check_installed, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
-from tdgc.config import ConfigError, LowLevelConfig
+from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
 from tdgc.parallel.cores import usable_cores, workers_flag
@@ -53,11 +54,13 @@ from tdgc.sim.geometry import read_geometry
 from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
 from tdgc.sim.world import WindowError
 from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.teacher import STYLES
 
 POLICIES = ("tdgc", "gp")
 TEACHER = "teacher"
-ALL_POLICIES = (*POLICIES, TEACHER)
+CUES = "cues"
+ALL_POLICIES = (*POLICIES, CUES, TEACHER)
 TUNED = "tdgc-tuned"  # beside "tdgc" where there is a tuning
 SHIPPED_HIGH = PRETRAINED / "high"
 
@@ -73,9 +76,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=100, help="a cell (100)")
     parser.add_argument(
         "--policies",
-        help="all, or of tdgc (the hierarchy), gp (the scripted baseline) and teacher (the script "
-        "that tdgc imitated first, which is told where everything is; not among all); all where "
-        "there is a high level, shipped or given by --high, and otherwise gp",
+        help="all, or of tdgc (the hierarchy), gp (the scripted baseline), cues (a script on the "
+        "cues of tdgc) and teacher (the script that tdgc imitated first, which is told where "
+        "everything is); all is tdgc and gp, the default where there is a high level, shipped or "
+        "given by --high, and otherwise gp",
     )
     parser.add_argument(
         "--conditions", default="nominal", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
@@ -298,6 +302,10 @@ class Evaluation:
                 drivers[name] = BaselineDriver()
             elif name == TEACHER:
                 drivers[name] = TeacherDriver(low, config)
+            elif name == CUES:
+                mdp = HighLevelConfig(commands=config.commands)
+                law = CuesLaw(config, measure_landing(low, config), mdp)
+                drivers[name] = HierarchyDriver(law, mdp)
             else:
                 assert self.high is not None
                 pair = load_high(self.high, low, config)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,11 +36,15 @@ class Driver(Protocol):
         config: the MDP of its decisions; cues "none" where it looks at none.
         bounds: what its commands stay within.
         action: (M, 13) of the last decision as the policy gave it; None where none is decoded.
+        told: the family that the semantic cue named; None where it is not looked at.
+        probes: (M, 32) m that the last decision looked at; None where it looked at none.
     """
 
     config: HighLevelConfig
     bounds: CommandRanges
     action: NDArray[np.floating] | None
+    told: str | None
+    probes: Array | None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         """New episodes for all robots of ``loco``.
@@ -86,6 +90,8 @@ class BaselineDriver:
         self.config = HighLevelConfig(cues="none")
         self.bounds = CommandRanges()
         self.action: NDArray[np.floating] | None = None
+        self.told: str | None = None
+        self.probes: Array | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
@@ -114,6 +120,8 @@ class TeacherDriver:
         self._landing = measure_landing(low, config)
         self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
+        self.told: str | None = None
+        self.probes: Array | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
@@ -128,6 +136,14 @@ class TeacherDriver:
         return self._command
 
 
+class Decides(Protocol):
+    """What the hierarchy needs of a high policy."""
+
+    def predict(self, obs: NDArray[np.float32], state: Any) -> tuple[NDArray[np.floating], Any]:
+        """o^H of M robots and the state returned before, None at first -> actions (M, 13) and the
+        next state."""
+
+
 class HierarchyDriver:
     """Drives robots by the recurrent high level (paper Sec. IV-B), ``tdgc``.
 
@@ -137,11 +153,13 @@ class HierarchyDriver:
         high, config: what ``load_high`` returned.
     """
 
-    def __init__(self, high: Policy, config: HighLevelConfig) -> None:
+    def __init__(self, high: Decides, config: HighLevelConfig) -> None:
         self._high, self.config = high, config
         assert config.commands is not None  # filled in by ``load_high``
         self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
+        self.told: str | None = None
+        self.probes: Array | None = None
         self._decoder = CommandDecoder(config.commands, config.action_limit)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
@@ -149,32 +167,38 @@ class HierarchyDriver:
         self._loco, self._goal = loco, goal
         seen = SEMANTIC.index(family if family in SEMANTIC else "unknown")
         self._families = np.full(m, seen)
+        if config.cues in ("both", "semantic"):
+            self.told = SEMANTIC[seen]
+        self._sensor = HeightProbes(loco, PROBES[config.probes], noise)
         self._horizon = round(
             config.episode_seconds / (config.decimation * loco.physics.control_dt)
         )
-        self._probes = HeightProbes(loco, PROBES[config.probes], noise)
-        self._probes.begin(np.arange(m))
-        self._state: policies.State | None = None
+        self._state: Any = None
         self._last = np.zeros((m, NUM_ACTIONS))
 
     def command(self, step: int) -> Array:
         decision, held = divmod(step, self.config.decimation)
         if held == 0:
-            if decision > 0:
-                self._probes.measure()
-            observation = observe_high(
-                self._loco,
-                self._goal,
-                np.full(self._loco.num_robots, decision / self._horizon),
-                self._last,
-                self._families,
-                self.config.cues,
-                self._probes.read(),
-            )
-            action, self._state = self._high.predict(observation, self._state)
-            self.action, self._last = action, self._decoder.normalise(action)
-            self._command = self._decoder.decode(action)
+            cues = self._observe(decision)
+            self.action, self._state = self._high.predict(cues, self._state)
+            self._last = self._decoder.normalise(self.action)
+            self._command = self._decoder.decode(self.action)
         return self._command
+
+    def _observe(self, decision: int) -> NDArray[np.float32]:
+        """o^H, as in training."""
+        rows = np.arange(self._loco.num_robots)
+        if decision == 0:
+            self._sensor.begin(rows)
+        else:
+            self._sensor.measure()
+        probes = self._sensor.read()
+        if self.config.cues in ("both", "geometric"):
+            self.probes = probes
+        share = np.full(len(rows), decision / self._horizon)
+        return observe_high(
+            self._loco, self._goal, share, self._last, self._families, self.config.cues, probes
+        )
 
 
 def load_high(

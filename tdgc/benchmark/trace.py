@@ -38,13 +38,13 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import TileField
 from tdgc.tasks import rewards
-from tdgc.tasks.high_env import SEMANTIC, command_share, high_step
-from tdgc.tasks.probes import NUM_PROBES, PROBES, height_probes
+from tdgc.tasks.high_env import command_share, high_step
+from tdgc.tasks.probes import NUM_PROBES, PROBES
 from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
 from tdgc.tasks.rules import OUTCOMES
 
 FORMAT = "tdgc-trace"
-VERSION = 1
+VERSION = 2
 
 
 class TraceError(InputError):
@@ -87,7 +87,9 @@ def _columns() -> Iterator[Column]:
     for name in _ACTIONS:
         yield Column(name, "1", "action of the policy, before it is decoded")
     for name, unit in zip(NAMES, UNITS, strict=True):
-        yield Column(f"command_{name}", unit, "command, as the low level got it")
+        yield Column(f"command_{name}", unit, "command, as it was carried out")
+    unit = UNITS[INDEX["frequency"]]
+    yield Column("asked_frequency", unit, "command, as it was asked for")
     yield Column("gait", "", "gait commanded")
     for name in CONTINUOUS:
         yield Column(f"at_bound_{name}", "1", "-1 or 1: at its lower or upper bound")
@@ -106,12 +108,12 @@ def _columns() -> Iterator[Column]:
         yield Column(name, "1", "term of the high level's reward, weighted")
 
 
-#: All columns in order. Numbers are float32. A value that there is none of is null: decisions in
-#: the last row, looks back in the first, actions and cues of a driver that has none, reward terms
-#: without a weight.
+#: All columns in order. Numbers are float32. A value that there is none of is null: decisions, and
+#: the probes that they look at, in the last row, looks back in the first, actions and cues of a
+#: driver that has none, reward terms without a weight.
 COLUMNS: tuple[Column, ...] = tuple(_columns())
 _TEXT = tuple(c.name for c in COLUMNS if not c.unit)
-_DECIDED = (*_ACTIONS, *_COMMANDS, "gait", *_AT_BOUND)
+_DECIDED = (*_PROBES, *_ACTIONS, *_COMMANDS, "asked_frequency", "gait", *_AT_BOUND)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +209,10 @@ class Tracer:
         if driver.action is not None:
             row.update(zip(_ACTIONS, driver.action.T.copy(), strict=True))
             self._actions = np.stack([self._decoder.normalise(driver.action), self._actions[0]])
-        row.update(zip(_COMMANDS, command.T.copy(), strict=True))
+        row.update(zip(_COMMANDS, self._loco.carried_out.T.copy(), strict=True))
+        row["asked_frequency"] = command[:, INDEX["frequency"]].copy()
+        if driver.probes is not None:
+            row.update(zip(_PROBES, driver.probes.T.copy(), strict=True))
         row["gait"] = np.array(GAITS, dtype=object)[gait_index(command)]
         for name, j in zip(CONTINUOUS, range(len(CONTINUOUS)), strict=True):
             low, high = getattr(driver.bounds, name)
@@ -252,25 +257,11 @@ class Tracer:
         row["pitch"], row["roll"] = self._tilt()
         row["goal_distance"] = np.linalg.norm(offset, axis=1)
         row["goal_bearing"] = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
-        self._add_cues(row)
+        row["family"] = np.full(len(nothing), self._driver.told, object)
         if self._count.any():
             self._add_execution(row)
         self._rows.append(row)
         self._count[:] = 0.0
-
-    def _add_cues(self, row: dict[str, NDArray[Any]]) -> None:
-        cues, family = self._driver.config.cues, self._cell.family
-        if cues in ("both", "semantic"):
-            told = family if family in SEMANTIC else "unknown"
-            row["family"] = np.full(self._loco.num_robots, told, object)
-        if cues in ("both", "geometric"):
-            row.update(
-                zip(
-                    _PROBES,
-                    height_probes(self._loco, PROBES[self._driver.config.probes]).T,
-                    strict=True,
-                )
-            )
 
     def _add_execution(self, row: dict[str, NDArray[Any]]) -> None:
         count = np.where(self._count > 0.0, self._count, np.nan)  # some ended long ago

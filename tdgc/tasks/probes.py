@@ -59,12 +59,13 @@ class HeightProbes:
         self.late = np.zeros(loco.num_robots, dtype=bool)
 
     def begin(self, index: NDArray[np.integer]) -> None:
-        """Episodes of the robots ``index`` (n,) begin: nothing was measured before."""
+        """Episodes of the robots ``index`` (n,) begin: they stood there a decision ago, too."""
         if self._noise is not None:
             late = self._noise.draws.uniform(0.0, 1.0, (len(index),))
             config = self._noise.config
             self.late[index] = late < config.scale * config.probe_delay
-        self.measured[:, index] = self._measure(index)
+        for when in (1, 0):
+            self.measured[when, index] = self._measure(index)
 
     def measure(self) -> None:
         """Look at the ground for the coming decision."""

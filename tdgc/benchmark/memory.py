@@ -1,0 +1,261 @@
+"""What a script may remember of the high policy's cues: where it is, what it saw.
+
+The high policy has a recurrent state for that.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.config import RobotConfig
+from tdgc.sim.commands import INDEX, gait_index
+from tdgc.sim.geometry import read_geometry
+from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, wrap_angle
+from tdgc.sim.terrain import GOAL_X, START_X, TILE_SIZE
+from tdgc.tasks.rules import GOAL_RADIUS
+
+
+class Reckoning:
+    """Where M robots are on their tiles, from the goal cue and the commands.
+
+    Distance and bearing of the goal leave the heading open. At the start they leave only a sign
+    open, since starts and goals are at known x; from then on the heading follows from how the
+    bearing changes, less what sideways motion changes of it. So there are two tracks, the goal to
+    the left of straight ahead or to the right of it, mirror images at first.
+
+    Args:
+        distance, bearing: (M,) m and rad, the goal cue at the start.
+
+    Attributes:
+        heading: (2, M) rad against the tile's x.
+        position: (2, M, 2) m; x in the tile's frame, y from the goal's.
+    """
+
+    def __init__(self, distance: Array, bearing: Array) -> None:
+        aside = np.arccos(np.clip((GOAL_X - START_X) / np.maximum(distance, 1e-6), -1.0, 1.0))
+        self.heading = np.stack([aside, -aside]) - bearing
+        self._bearing = bearing
+        self._place(distance, bearing)
+
+    def move(self, distance: Array, bearing: Array, velocity: Array, dt: float) -> None:
+        """Go on to the goal cue ``dt`` s later, ``velocity`` (M, 2) m/s in the heading frame having
+        been commanded meanwhile."""
+        sideways = velocity[:, 1] * np.cos(self._bearing) - velocity[:, 0] * np.sin(self._bearing)
+        near = np.maximum(distance, GOAL_RADIUS)  # nearer the bearing says nothing
+        turned = wrap_angle(bearing - self._bearing) + dt * sideways / near
+        self.heading = wrap_angle(self.heading - turned)
+        self._bearing = bearing
+        self._place(distance, bearing)
+
+    def _place(self, distance: Array, bearing: Array) -> None:
+        direction = self.heading + bearing
+        ahead = np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+        self.position = np.array([GOAL_X, 0.0]) - distance[:, None] * ahead
+
+    def points(self, points: Array) -> Array:
+        """``points`` (n, 2) m of the heading frame on both tracks, (2, M, n, 2) m."""
+        c, s = np.cos(self.heading)[..., None], np.sin(self.heading)[..., None]
+        x, y = points.T
+        return self.position[..., None, :] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+class Delay:
+    """Whether the probes of M robots are a decision late.
+
+    A trunk that bobs shows in the heights ahead as well as in the joints of the legs that stand.
+
+    Args:
+        robot: says where its feet are.
+    """
+
+    _MOST = 0.04  # m, of a difference: more is uneven ground, or all feet in the air
+
+    def __init__(self, robot: RobotConfig, num_robots: int) -> None:
+        self._base, self._geometry = robot.base_height, read_geometry(robot)
+        self._pose = nominal_pose(robot)
+        self._before: Array | None = None  # it stood like that a decision ago, too
+        self._off = np.zeros((2, num_robots))
+
+    def add(self, gravity: Array, joint_error: Array, ground: Array) -> None:
+        """Compare the ``ground`` (M,) m that the probes have, against a standing robot's, to what
+        gravity (M, 3) in the trunk's frame and joints (M, 12) rad off the nominal pose say."""
+        feet, _ = foot_kinematics(self._geometry, self._pose + joint_error, 0.0 * joint_error)
+        stand = np.einsum("mfi,mi->mf", feet, gravity).max(axis=1) + self._geometry.foot_radius
+        now = self._base - stand
+        expected = np.stack([now, now if self._before is None else self._before])
+        self._off += np.minimum(np.abs(ground - expected), self._MOST) ** 2
+        self._before = now
+
+    def late(self) -> NDArray[np.bool_]:
+        """Whether what the joints said a decision ago explains the probes better, (M,)."""
+        return self._off[1] < self._off[0]
+
+
+class Profile:
+    """What M robots have probed along their ways: ground or trench, by x, on both tracks.
+
+    A trench crosses the whole tile. So on the right track all probes of one x agree.
+    """
+
+    _BIN = 0.01  # m, of the line ahead, from which lips are found
+    _WIDE = 0.05  # m, of all probes, by which tracks are told apart
+    _SURE = 2.0  # disagreeing probes more that rule a track out: a lip alone makes one or two
+
+    def __init__(self, num_robots: int) -> None:
+        size = round((TILE_SIZE + 2.0) / self._BIN)
+        self._line = np.zeros((2, 2, num_robots, size))  # track, ground or trench
+        self._all = np.zeros((2, 2, num_robots, round(size * self._BIN / self._WIDE)))
+
+    def add(self, x: Array, deep: NDArray[np.bool_], ahead: NDArray[np.bool_]) -> None:
+        """Probes at ``x`` (2, M, n) m, on either track, some of them ``deep`` (M, n); lips are
+        found from those on the line ``ahead`` (n,)."""
+        rows = np.arange(len(deep))[:, None]
+        for counts, width, some in (
+            (self._all, self._WIDE, np.ones_like(ahead)),
+            (self._line, self._BIN, ahead),
+        ):
+            place = np.clip((x[..., some] / width).astype(int), 0, counts.shape[-1] - 1)
+            for track in range(2):
+                np.add.at(counts[track], (deep[:, some].astype(int), rows, place[track]), 1.0)
+
+    def track(self) -> NDArray[np.int64]:
+        """Which track each robot is on, (M,): 0, 1, or -1 while they cannot be told apart."""
+        ground, deep = self._all[:, 0], self._all[:, 1]
+        odd = np.sum(ground * deep / np.maximum(ground + deep, 1.0), axis=-1)
+        return np.where(np.abs(odd[0] - odd[1]) < self._SURE, -1, odd.argmin(axis=0))
+
+    def trenches(self, robot: int, track: int, widest: float) -> Array:
+        """x of the lips (k, 2) m of the trenches found; one whose end is out of sight is taken for
+        ``widest`` m."""
+        ground, deep = self._line[track, :, robot]
+        known = np.flatnonzero(ground + deep)
+        inside = deep[known] > ground[known]
+        change = np.flatnonzero(np.diff(inside))
+        edges = 0.5 * self._BIN * (known[change] + known[change + 1] + 1)
+        begins, ends = edges[inside[change + 1]], edges[~inside[change + 1]]
+        ends = ends[ends > begins[0]] if begins.size else ends[:0]
+        if ends.size < begins.size:
+            ends = np.append(ends, begins[-1] + widest)
+        return np.column_stack([begins, ends])
+
+    def seen(self, robot: int, track: int) -> float:
+        """The largest x that was probed ahead, in m."""
+        return float(np.flatnonzero(self._line[track, :, robot].sum(axis=0))[-1] * self._BIN)
+
+
+class Clock:
+    """The gait clocks of M robots, from the clock cue, which is the same twice in a cycle.
+
+    Args:
+        robot: says how a gait begins.
+        signal: (M, 4) the cue at the start, as ``PhaseClock.signal`` gives it.
+    """
+
+    def __init__(self, robot: RobotConfig, signal: Array) -> None:
+        self._robot = robot
+        self._cycles = np.zeros(len(signal))
+        self._gait = np.zeros(len(signal), dtype=np.int64)
+        self._doubtful = True  # whether the cue was seen only once
+        self.now = self._either(signal)[0]
+
+    def move(self, signal: Array, command: Array, dt: float, steps: int) -> None:
+        """Go on to the cue after ``steps`` control steps of ``dt`` s of the commands (M, 15)."""
+        gait, asked = gait_index(command), command[:, INDEX["frequency"]]
+        self._cycles[gait != self._gait] = 0.0
+        self._gait = gait
+        run = np.zeros(len(signal))
+        for _ in range(steps):
+            begun = np.minimum(self._cycles / max(self._robot.start_cycles, 1e-6), 1.0)
+            hurry = (1.0 - begun) * np.maximum(self._robot.start_frequency - asked, 0.0)
+            self._cycles += dt * (asked + hurry)
+            run += dt * (asked + hurry)
+        before = [self.now, 0.5 - self.now] if self._doubtful else [self.now]
+        self._doubtful = False
+        now = self._either(signal)
+        off = np.array([[_apart(a + run, b) for b in now] for a in before])
+        self.now = np.choose(off.min(axis=0).argmin(axis=0), now)
+
+    @staticmethod
+    def _either(signal: Array) -> tuple[Array, Array]:
+        """The two clocks that give the cue: in trot and pronk the right front foot's phase."""
+        first = np.arcsin(np.clip(signal[:, 1], -1.0, 1.0)) / (2.0 * np.pi)
+        return np.mod(first, 1.0), np.mod(0.5 - first, 1.0)
+
+
+def _apart(a: Array, b: Array) -> Array:
+    """How far apart two clocks are, in cycles."""
+    return np.abs(np.mod(a - b + 0.5, 1.0) - 0.5)
+
+
+class Obstacles:
+    """Pillars that M robots have seen, and the way around them.
+
+    Each robot keeps the cells in which something tall stood, and plans on a window around itself:
+    beyond the window the way to the goal is straight.
+    """
+
+    _CELL = 0.05  # m, of what was seen
+    _STEP, _HALF = 0.1, 12  # m and cells: the window is 2.5 m wide
+    _RADIUS, _WIDE = 0.28, 0.5  # m from a pillar: blocked within, free beyond; as for the teacher
+    _BLOCKED, _CLOSE = 30.0, 3.0  # cost of a metre inside the radius and at it; 1 in the open
+    _LOOK = 0.35  # m ahead, where the lowest cost is looked for; as for the teacher
+    _AHEAD = 0.02  # m per rad, so that near ties go to the straight way
+    _RAYS = np.linspace(-np.pi, np.pi, 48, endpoint=False)
+
+    def __init__(self, num_robots: int) -> None:
+        self._seen: list[set[tuple[int, int]]] = [set() for _ in range(num_robots)]
+        axis = self._STEP * np.arange(-self._HALF, self._HALF + 1)
+        self._window = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+
+    def add(self, robot: int, points: Array) -> None:
+        """Something tall at ``points`` (n, 2) m."""
+        self._seen[robot].update(map(tuple, np.round(points / self._CELL).astype(int).tolist()))
+
+    def direction(self, robot: int, at: Array, goal: Array, ahead: float) -> float:
+        """Where to go from ``at`` (2,) m to get to ``goal`` (2,) m, in rad; ``ahead`` rad, the
+        straight way, where nothing is in it."""
+        seen = self._CELL * np.array(sorted(self._seen[robot]), dtype=float).reshape(-1, 2)
+        seen = seen[(np.abs(seen - at) < self._STEP * self._HALF + self._WIDE).all(axis=1)]
+        if not seen.size or np.linalg.norm(goal - at) < self._LOOK:
+            return ahead
+        cells = at + self._window
+        away = np.linalg.norm(cells[..., None, :] - seen, axis=-1).min(axis=-1)
+        near = np.clip((self._WIDE - away) / (self._WIDE - self._RADIUS), 0.0, 1.0)
+        price = np.where(away < self._RADIUS, self._BLOCKED, 1.0 + (self._CLOSE - 1.0) * near)
+        straight = np.linalg.norm(cells - goal, axis=-1)
+        cost = np.full(price.shape, np.inf)
+        for edge in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+            cost[edge] = straight[edge] + self._STEP * (price[edge] - 1.0)
+        home = straight < self._STEP
+        cost[home] = straight[home]
+        cost = _settle(cost, self._STEP * price)
+        rays = np.stack([np.cos(self._RAYS), np.sin(self._RAYS)], axis=-1)
+        value = _between(cost, self._HALF + self._LOOK / self._STEP * rays)
+        value += self._AHEAD * np.abs(wrap_angle(self._RAYS - ahead))
+        return float(self._RAYS[value.argmin()])
+
+
+def _settle(cost: Array, price: Array) -> Array:
+    """Least costs of getting out, (n, n): ``cost`` where one is out, inf elsewhere; ``price`` of
+    each cell."""
+    n = len(cost)
+    shifts = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
+    while True:
+        wide = np.pad(cost, 1, constant_values=np.inf)
+        around = [
+            wide[1 + a : 1 + a + n, 1 + b : 1 + b + n] + np.hypot(a, b) * price for a, b in shifts
+        ]
+        settled = np.minimum(cost, np.min(around, axis=0))
+        if np.array_equal(settled, cost):
+            return cost
+        cost = settled
+
+
+def _between(grid: Array, at: Array) -> Array:
+    """Values of a grid (n, n) between its cells, at (m, 2) in cells."""
+    i, j = np.floor(at).astype(int).T
+    a, b = at.T - (i, j)
+    return (1 - a) * ((1 - b) * grid[i, j] + b * grid[i, j + 1]) + a * (
+        (1 - b) * grid[i + 1, j] + b * grid[i + 1, j + 1]
+    )

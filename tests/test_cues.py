@@ -1,0 +1,170 @@
+"""The scripted law on the cues: what it remembers is right, and it gets to the goal by it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tdgc.benchmark import evaluation
+from tdgc.benchmark.cues import CuesLaw
+from tdgc.benchmark.cues import Memory as LawMemory
+from tdgc.benchmark.drivers import HierarchyDriver
+from tdgc.benchmark.evaluation import Cell, run_cell
+from tdgc.benchmark.memory import Clock, Obstacles, Profile, Reckoning
+from tdgc.config import HighLevelConfig, RobotConfig
+from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.gaits import PhaseClock, gait_embedding
+from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.terrain import GOAL_X, START_X
+from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.probes import PROBES
+
+LOW, CONFIG = load_low(PRETRAINED / "low")
+POINTS = PROBES["lines"]
+
+
+# ------------------------------------------------------------------ what it remembers
+
+
+def goal_cue(position: Array, heading: Array, goal: Array) -> tuple[Array, Array]:
+    offset = goal - position
+    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - heading)
+    return np.linalg.norm(offset, axis=1), bearing
+
+
+def test_one_of_two_tracks_is_where_the_robot_is() -> None:
+    """Robots that weave and sidestep to goals on either side, 0.1 s a decision."""
+    goal = np.array([[GOAL_X, 1.5], [GOAL_X, -0.8]])
+    position, heading = np.array([[START_X, 0.0]] * 2), np.array([0.4, -0.3])
+    where = Reckoning(*goal_cue(position, heading, goal))
+    for step in range(50):
+        velocity, turn = np.array([[0.8, 0.2 * np.sin(0.3 * step)]] * 2), np.sin(0.2 * step)
+        c, s = np.cos(heading), np.sin(heading)
+        world = np.stack(
+            [c * velocity[:, 0] - s * velocity[:, 1], s * velocity[:, 0] + c * velocity[:, 1]],
+            axis=1,
+        )
+        position, heading = position + 0.1 * world, wrap_angle(heading + 0.1 * turn)
+        where.move(*goal_cue(position, heading, goal), velocity, 0.1)
+    for robot, track in ((0, 0), (1, 1)):  # the goal to the left, and to the right
+        assert where.heading[track, robot] == pytest.approx(heading[robot], abs=0.05)
+        wanted = position[robot] - [0.0, goal[robot, 1]]
+        assert where.position[track, robot] == pytest.approx(wanted, abs=0.1)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.1, 0.3, 0.45, 0.6, 0.8, 0.95])
+def test_the_clock_is_found_in_its_signal(start: float) -> None:
+    """From a trot into a leap, whose frequency is not at once what is asked for."""
+    robot, clock = RobotConfig(), PhaseClock(1)
+    command = default_command()[None]
+    duration = command[:, INDEX["duration"]]
+    clock.reset(np.arange(1), start)
+    clock.update(command[:, 12:], duration)
+    found = Clock(robot, clock.signal())
+    for decision in range(20):
+        command[:, INDEX["frequency"]] = 2.3 + 0.5 * np.sin(decision)
+        command[:, 12:] = gait_embedding(0 if decision < 8 else 1)
+        for _ in range(5):
+            clock.update(command[:, 12:], duration)
+            asked = command[:, INDEX["frequency"]]
+            hurry = (1.0 - clock.begun(robot.start_cycles)) * (robot.start_frequency - asked)
+            clock.advance(0.02, asked + hurry, command[:, 12:], duration)
+        found.move(clock.signal(), command, 0.02, 5)
+        if decision >= 2:
+            assert found.now == pytest.approx(clock.clock, abs=1e-4)
+
+
+def test_lips_and_track_come_from_what_was_probed() -> None:
+    """A robot walks along track 1, its heading off by 0.3 rad on the other."""
+    trenches = np.array([[2.12, 2.41], [3.3, 3.55]])
+    profile, ahead = Profile(1), POINTS[:, 1] == 0.0
+    x, y = POINTS.T
+    for at in np.arange(0.75, 3.2, 0.093):
+        deep = ((at + x > trenches[:, :1]) & (at + x < trenches[:, 1:])).any(axis=0)
+        off = at + np.cos(0.3) * x - np.sin(0.3) * y
+        profile.add(np.stack([off, at + x])[:, None], deep[None], ahead)
+        if at < 1.0:
+            assert profile.track()[0] == -1
+    assert profile.track()[0] == 1
+    assert profile.trenches(0, 1, 0.35) == pytest.approx(trenches, abs=0.011)
+    assert profile.seen(0, 1) == pytest.approx(at + x.max(), abs=0.011)
+
+
+def test_a_trench_whose_end_is_out_of_sight_is_as_wide_as_any() -> None:
+    profile, ahead = Profile(1), np.ones(20, dtype=bool)
+    x = 1.0 + 0.05 * np.arange(20)
+    profile.add(np.stack([x, x])[:, None], (x > 1.78)[None], ahead)
+    assert profile.trenches(0, 0, 0.35) == pytest.approx(np.array([[1.78, 2.13]]), abs=0.025)
+    assert Profile(1).trenches(0, 0, 0.35).shape == (0, 2)
+
+
+def test_the_way_leads_around_what_was_seen() -> None:
+    obstacles, goal = Obstacles(1), np.array([6.0, 0.0])
+    at = np.array([2.0, 0.05])
+    assert obstacles.direction(0, at, goal, 0.0) == 0.0
+    angles = np.linspace(0.0, 2.0 * np.pi, 40)
+    pillar = np.array([3.0, 0.0])
+    obstacles.add(0, pillar + 0.15 * np.stack([np.cos(angles), np.sin(angles)], axis=1))
+    closest = np.inf
+    for _ in range(80):
+        offset = goal - at
+        ahead = float(np.arctan2(offset[1], offset[0]))
+        way = obstacles.direction(0, at, goal, ahead)
+        at = at + 0.05 * np.array([np.cos(way), np.sin(way)])
+        closest = min(closest, float(np.linalg.norm(at - pillar)))
+    assert 0.15 + 0.24 < closest < 0.7
+    assert at[0] > 5.0 and abs(at[1]) < 0.5
+
+
+# ------------------------------------------------------------------ where it gets by it
+
+
+class Watched(CuesLaw):
+    """The law, whose memory can be looked at."""
+
+    memory: LawMemory
+
+    def predict(
+        self, obs: np.ndarray, state: LawMemory | None = None
+    ) -> tuple[np.ndarray, LawMemory]:
+        action, self.memory = super().predict(obs, state)
+        return action, self.memory
+
+
+@pytest.fixture(scope="module")
+def law() -> Watched:
+    return Watched(CONFIG, measure_landing(LOW, CONFIG), HighLevelConfig(commands=CONFIG.commands))
+
+
+def run(law: CuesLaw, condition: str, family: str, level: int, count: int) -> list[str]:
+    driver = HierarchyDriver(law, HighLevelConfig(commands=CONFIG.commands))
+    cell = Cell("cues", condition, family, level, 0, count)
+    return [e.outcome for e in run_cell(cell, LOW, driver, seed=11)]
+
+
+@pytest.mark.parametrize(("condition", "late"), [("nominal", False), ("noise", True)])
+def test_late_probes_are_noticed(
+    law: Watched, condition: str, late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluation, "HORIZON", 0.6)
+    run(law, condition, "gap", 4, 4)
+    assert (law.memory.delay.late() == late).all()
+
+
+@pytest.mark.parametrize(
+    ("condition", "family", "level"),
+    [
+        ("nominal", "gap", 5),
+        ("nominal", "pillar", 9),
+        ("no-family", "gap", 5),
+        ("no-family", "pillar", 8),
+        ("no-family", "stair", 3),
+    ],
+)
+def test_it_gets_to_its_goals(law: Watched, condition: str, family: str, level: int) -> None:
+    outcomes = run(law, condition, family, level, 4)
+    assert outcomes.count("reached") >= 3, outcomes
+    if condition == "no-family":
+        assert law.memory.gap.all() == (family == "gap")
+        assert law.memory.pillar.all() == (family == "pillar")
