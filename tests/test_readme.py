@@ -23,7 +23,7 @@ from tdgc.benchmark.evaluation import CONDITIONS
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT
-from tdgc.sim.terrain import ALL_FAMILIES, PARAMETER_RANGES, file_label
+from tdgc.sim.terrain import ALL_FAMILIES, PARAMETER_RANGES
 from tdgc.tasks.high_env import high_layout
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,49 +47,55 @@ class Run:
     leaves: tuple[str, ...]
 
 
-LOW = "--steps 128 --n-envs 4 --workers 1"
-HIGH = "--steps 16 --n-envs 4 --workers 1 --set ppo.n_steps=2 --set ppo.minibatches=1"
+LOW = "--steps 128 --n-envs 4 --workers 1 --set log_steps=128 --set calibration.robots=0"
+HIGH = (
+    "--steps 16 --n-envs 4 --workers 1 --set log_steps=8 "
+    "--set ppo.n_steps=2 --set ppo.minibatches=1"
+)
 ONE = "--episodes 1 --workers 1"
 FALL = f"--policies gp --families gap --levels 10 {ONE}"  # in the first trench, within seconds
 #: Commands that run: chains of which each needs what those before it leave.
 CHAINS: tuple[dict[str, Run], ...] = (
     {
         "python train_low.py": Run(
-            f"{LOW} --set calibration.robots=64 --set calibration.turns=1",
+            LOW,
             (
                 "runs/low/config.json",
                 "runs/low/policy.json",
-                "runs/low/uncalibrated.safetensors",
                 "runs/low/checkpoints/step-000000000128",
                 "runs/low/tensorboard",
                 "runs/low/training.png",
             ),
         ),
         "python train_low.py --resume --time-limit 3600": Run(
-            "--steps 256 --set calibration.robots=0",
+            "--steps 256",
             ("runs/low/policy.safetensors", "runs/low/checkpoints/step-000000000256"),
         ),
         "tensorboard --logdir runs": Run("--inspect --logdir runs/low", ()),
-        "python -m tdgc.calibration --low runs/low/uncalibrated --out runs/calibrated": Run(
-            "--robots 64 --turns 1 --workers 1", ("runs/calibrated.safetensors",)
-        ),
         "python train_high.py --low runs/low/policy": Run(
-            HIGH, ("runs/high/policy.safetensors", "runs/high/log.jsonl")
+            HIGH, ("runs/high/policy.safetensors", "runs/high/training.png")
         ),
         "python evaluate.py --low runs/low/policy --high runs/high/policy --levels 6-10": Run(
             f"--levels 6 --families tilt {ONE} --out runs/pair",
             tuple(
                 f"runs/pair/{name}"
-                for name in ("episodes.csv", "summary.json", "success.png", "gaits.png",
-                             "headings.png", "trajectories.png", "trajectories.npz")
+                for name in (
+                    "episodes.csv",
+                    "summary.json",
+                    "success.png",
+                    "gaits.png",
+                    "headings.png",
+                    "trajectories.png",
+                    "trajectories.npz",
+                )
             ),
-        ),  # fmt: skip
+        ),
         "python evaluate.py --low runs/low/policy --tracking": Run(
             f"{ONE} --out runs/tracking", ("runs/tracking/tracking.json",)
         ),
         "python -m tdgc.export --low runs/low/policy --high runs/high/policy --out runs/export": (
             Run(
-                "--format torchscript",
+                "--low tdgc/pretrained/low --high tdgc/pretrained/high --format torchscript",
                 ("runs/export/low.pt", "runs/export/high_interface.json"),
             )
         ),
@@ -100,9 +106,7 @@ CHAINS: tuple[dict[str, Run], ...] = (
     },
     {
         ".venv/bin/python evaluate.py --families stair,gap --levels 6 --episodes 1 "
-        "--policies tdgc --video": Run(
-            FALL.replace("gp", "tdgc"), ("runs/evaluation/report.html", "runs/evaluation/films")
-        ),
+        "--policies tdgc --video": Run(FALL, ("runs/evaluation/report.html",)),
         "python evaluate.py --video --families stair,gap --levels 8": Run(
             FALL,
             (
@@ -125,15 +129,12 @@ CHAINS: tuple[dict[str, Run], ...] = (
             Run(f"--levels 0 --families rough {ONE}", ("runs/evaluation/tuning.json",))
         ),
         "python evaluate.py --families hills.npy": Run(
-            f"--levels 5 --policies gp {ONE} --video",
-            (f"runs/evaluation/films/sheet_gp_nominal_{file_label('hills.npy')}_05_000.png",),
+            f"--levels 5 --policies gp {ONE}", ("runs/evaluation/trajectories.png",)
         ),
     },
     {
         "python train_low.py --set env.robot.urdf=a1/a1.urdf --set env.robot.base_height=0.27 "
-        "--out runs/a1_low": Run(
-            f"{LOW} --set calibration.robots=0", ("runs/a1_low/policy.safetensors",)
-        ),
+        "--out runs/a1_low": Run(LOW, ("runs/a1_low/policy.safetensors",)),
         "python train_high.py --low runs/a1_low/policy --out runs/a1_high": Run(
             HIGH, ("runs/a1_high/policy.safetensors",)
         ),
@@ -151,6 +152,7 @@ READ = (
     "python evaluate.py --gui",
     "python evaluate.py --gui watch --families stair --levels 6",
     "python train_high.py --preset paper --out runs/paper",
+    "python -m tdgc.calibration --low runs/low/policy --out runs/calibrated",
     "OMP_NUM_THREADS=1 python train_low.py --workers 1",
     "python -m tdgc.bench --load",
     "python -m tdgc.bench --update",
