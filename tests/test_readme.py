@@ -1,160 +1,248 @@
-"""README is true: its commands and code run, its tables are what the code has."""
+"""The documents are true: their commands and code run, their tables are what the code has."""
 
+import argparse
+import configparser
 import os
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from test_structure import DOORS, FLOOR
 
 import evaluate
+import train_high
 import train_low
+from tdgc import bench, calibration, export, policies
 from tdgc.benchmark.evaluation import CONDITIONS
 from tdgc.sim.commands import CommandDecoder
-from tdgc.sim.terrain import file_label
+from tdgc.sim.gaits import GAIT_TABLE, GAITS
+from tdgc.sim.terrain import ALL_FAMILIES, PARAMETER_RANGES
+from tdgc.tasks.high_env import PRETRAINED
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-
-BY_CI = None  # .ci/run runs the set-up and the tests as README has them
-TRAIN = "--steps 128 --n-envs 4 --workers 1"
-TRAIN_HIGH = "--steps 16 --n-envs 4 --workers 1 --set ppo.n_steps=2 --set ppo.minibatches=1"
-#: Each command of README -> what is added to make it short, or BY_CI. ``{tmp}`` is a folder that
-#: the commands share; they are in README's order.
-COMMANDS: dict[str, str | None] = {
-    "python3 -m venv .venv": BY_CI,
-    ".venv/bin/pip install -c constraints.txt -e .": BY_CI,
-    ".venv/bin/python evaluate.py --levels 6-10": (
-        "--levels 6 --families tilt --episodes 1 --workers 1 --out {tmp}/first"
-    ),
-    ".venv/bin/pip install -c constraints.txt -e '.[dev]'": BY_CI,
-    ".venv/bin/python -m pytest -n 2": BY_CI,
-    "python train_low.py": f"{TRAIN} --out {{tmp}}/low",
-    "python train_low.py --resume --time-limit 3600": "--steps 256 --out {tmp}/low",
-    "tensorboard --logdir runs": "--inspect --logdir {tmp}/low",
-    "python -m tdgc.calibration --low runs/low/policy --out runs/low/calibrated": (
-        "--low {tmp}/low/policy --robots 64 --turns 1 --workers 1 --out {tmp}/low/calibrated"
-    ),
-    "python train_high.py --low runs/low/calibrated": (
-        f"{TRAIN_HIGH} --low {{tmp}}/low/calibrated --out {{tmp}}/high"
-    ),
-    "python evaluate.py --low runs/low/calibrated --policies gp --levels 6-10": (
-        "--low {tmp}/low/calibrated --policies gp --levels 6 --families tilt --episodes 1 "
-        "--workers 1 --out {tmp}/evaluation"
-    ),
-    "python evaluate.py --tracking": "--episodes 1 --workers 1 --out {tmp}/tracking",
-    "python evaluate.py --policies teacher --families stair,gap --episodes 20": (
-        "--families gap --levels 6 --episodes 1 --workers 1 --out {tmp}/teacher"
-    ),
-    "python evaluate.py --trace failed": (
-        "--policies gp --levels 10 --families gap --episodes 1 --workers 1 --out {tmp}/trace"
-    ),
-    "python evaluate.py --policies tdgc --set decoder.vx.high=0.6 --set safety.max_tilt=0.5": (
-        "--levels 0 --families rough --episodes 1 --workers 1 --out {tmp}/tune"
-    ),
-    "python evaluate.py --video --families stair,gap --levels 8": (
-        "--policies gp --levels 10 --families gap --episodes 1 --workers 1 --out {tmp}/video"
-    ),
-    "python -m tdgc.export --low runs/low/calibrated --high runs/high/policy --out runs/export": (
-        "--low {tmp}/low/calibrated --high {tmp}/high/policy --format torchscript "
-        "--out {tmp}/export"
-    ),
-    "python -m tdgc.bench --out runs/bench": (
-        "--robots 2 --workers 1 --seconds 0.1 --out {tmp}/bench"
-    ),
-    "python train_low.py --set env.robot.urdf=a1/a1.urdf --set env.robot.base_height=0.27 "
-    "--out runs/a1_low": f"{TRAIN} --set env.robot.urdf={{tmp}}/a1/a1.urdf --out {{tmp}}/a1_low",
-    "python train_high.py --low runs/a1_low/policy --out runs/a1_high": (
-        f"{TRAIN_HIGH} --low {{tmp}}/a1_low/policy --out {{tmp}}/a1_high"
-    ),
-    "python evaluate.py --families hills.npy": (
-        "--families {tmp}/hills.npy --levels 5 --policies gp --episodes 1 --workers 1 --video "
-        "--out {tmp}/own"
-    ),
-    "python train_high.py --init tdgc/pretrained/high "
-    """--set 'env.families=["rough","stair","hills.npy"]' --out runs/hills""": (
-        """--set 'env.families=["rough","{tmp}/hills.npy"]' --steps 8 --n-envs 2 --workers 1 """
-        "--set ppo.n_steps=4 --set ppo.minibatches=1 --out {tmp}/hills"
-    ),
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXT = {path.name: path.read_text(encoding="utf-8") for path in DOCUMENTS}
+MAINS = {
+    "train_low.py": train_low.main,
+    "train_high.py": train_high.main,
+    "evaluate.py": evaluate.main,
+    "tdgc.bench": bench.main,
+    "tdgc.calibration": calibration.main,
+    "tdgc.export": export.main,
 }
-#: What is in ``{tmp}`` afterwards.
-OUTPUTS = (
-    "first/summary.json",
-    "first/report.html",
-    "low/config.json",
-    "low/policy.json",
-    "low/policy.safetensors",
-    "low/calibrated.safetensors",
-    "low/checkpoints/step-000000000128",
-    "low/checkpoints/step-000000000256",
-    "low/tensorboard",
-    "high/policy.safetensors",
-    "evaluation/episodes.csv",
-    "evaluation/summary.json",
-    "evaluation/success.png",
-    "tracking/tracking.json",
-    "teacher/summary.json",
-    "trace/diagnosis.csv",
-    "trace/traces/gp_nominal_gap_10_000.parquet",
-    "tune/tuning.json",
-    "video/films/film_gp_nominal_gap_10_000.mp4",
-    "video/films/strip_gap_10.png",
-    "export/low.pt",
-    "export/high_interface.json",
-    "a1_low/policy.safetensors",
-    "a1_high/policy.safetensors",
-    "bench/bench.json",
-    "own/trajectories.png",
-    "own/films/sheet_gp_nominal_{map}_05_000.png",
-    "hills/policy.safetensors",
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is added to a command to make it short, and files that it leaves, in the workspace."""
+
+    added: str
+    leaves: tuple[str, ...]
+
+
+LOW = "--steps 128 --n-envs 4 --workers 1 --set log_steps=128 --set calibration.robots=0"
+HIGH = (
+    "--steps 16 --n-envs 4 --workers 1 --set log_steps=8 "
+    "--set ppo.n_steps=2 --set ppo.minibatches=1"
+)
+ONE = "--episodes 1 --workers 1"
+FALL = f"--policies gp --families gap --levels 10 {ONE}"  # in the first trench, within seconds
+#: Commands that run: chains of which each needs what those before it leave.
+CHAINS: tuple[dict[str, Run], ...] = (
+    {
+        "python train_low.py": Run(
+            LOW,
+            (
+                "runs/low/config.json",
+                "runs/low/policy.json",
+                "runs/low/checkpoints/step-000000000128",
+                "runs/low/tensorboard",
+                "runs/low/training.png",
+            ),
+        ),
+        "python train_low.py --resume --time-limit 3600": Run(
+            "--steps 256",
+            ("runs/low/policy.safetensors", "runs/low/checkpoints/step-000000000256"),
+        ),
+        "tensorboard --logdir runs": Run("--inspect --logdir runs/low", ()),
+        "python train_high.py --low runs/low/policy": Run(
+            HIGH, ("runs/high/policy.safetensors", "runs/high/training.png")
+        ),
+        "python evaluate.py --low runs/low/policy --high runs/high/policy --levels 6-10": Run(
+            f"--levels 6 --families tilt {ONE} --out runs/pair",
+            tuple(
+                f"runs/pair/{name}"
+                for name in (
+                    "episodes.csv",
+                    "summary.json",
+                    "success.png",
+                    "gaits.png",
+                    "headings.png",
+                    "trajectories.png",
+                    "trajectories.npz",
+                )
+            ),
+        ),
+        "python evaluate.py --low runs/low/policy --tracking": Run(
+            f"{ONE} --out runs/tracking", ("runs/tracking/tracking.json",)
+        ),
+        "python -m tdgc.export --low runs/low/policy --high runs/high/policy --out runs/export": (
+            Run(
+                "--low tdgc/pretrained/low --high tdgc/pretrained/high --format torchscript",
+                ("runs/export/low.pt", "runs/export/high_interface.json"),
+            )
+        ),
+        "python train_high.py --low runs/low/policy --init runs/high/policy "
+        """--set 'env.families=["rough","stair","hills.npy"]' --out runs/hills""": Run(
+            HIGH, ("runs/hills/policy.safetensors",)
+        ),
+    },
+    {
+        ".venv/bin/python evaluate.py --families stair,gap --levels 6 --episodes 1 "
+        "--policies tdgc --video": Run(FALL, ("runs/evaluation/report.html",)),
+        "python evaluate.py --video --families stair,gap --levels 8": Run(
+            FALL,
+            (
+                "runs/evaluation/films/film_gp_nominal_gap_10_000.mp4",
+                "runs/evaluation/films/sheet_gp_nominal_gap_10_000.png",
+                "runs/evaluation/films/strip_gap_10.png",
+            ),
+        ),
+        "python evaluate.py --trace failed": Run(
+            FALL,
+            (
+                "runs/evaluation/diagnosis.csv",
+                "runs/evaluation/traces/gp_nominal_gap_10_000.parquet",
+            ),
+        ),
+        "python evaluate.py --policies teacher --families stair,gap --episodes 20": Run(
+            f"--families gap --levels 6 {ONE}", ("runs/evaluation/summary.json",)
+        ),
+        "python evaluate.py --policies tdgc --set decoder.vx.high=0.6 --set safety.max_tilt=0.5": (
+            Run(f"--levels 0 --families rough {ONE}", ("runs/evaluation/tuning.json",))
+        ),
+        "python evaluate.py --families hills.npy": Run(
+            f"--levels 5 --policies gp {ONE}", ("runs/evaluation/trajectories.png",)
+        ),
+    },
+    {
+        "python train_low.py --set env.robot.urdf=a1/a1.urdf --set env.robot.base_height=0.27 "
+        "--out runs/a1_low": Run(LOW, ("runs/a1_low/policy.safetensors",)),
+        "python train_high.py --low runs/a1_low/policy --out runs/a1_high": Run(
+            HIGH, ("runs/a1_high/policy.safetensors",)
+        ),
+    },
+    {
+        "python -m tdgc.bench --out runs/bench": Run(
+            "--robots 2 --workers 1 --seconds 0.1", ("runs/bench/bench.json",)
+        ),
+    },
+)
+RUNS = {command: run for chain in CHAINS for command, run in chain.items()}
+#: Commands that take long, or need a display or a cluster: their flags are read.
+READ = (
+    "python evaluate.py --tracking",
+    "python evaluate.py --gui",
+    "python evaluate.py --gui watch --families stair --levels 6",
+    "python train_high.py --preset paper --out runs/paper",
+    "python -m tdgc.calibration --low runs/low/policy --out runs/calibrated",
+    "OMP_NUM_THREADS=1 python train_low.py --workers 1",
+    "python -m tdgc.bench --load",
+    "python -m tdgc.bench --update",
+    "python -m tdgc.bench --cluster auto",
+    "python train_high.py --low runs/low/policy --cluster auto --workers auto",
+    "python evaluate.py --cluster auto",
+)
+#: Ray's own.
+RAY = (
+    "RAY_worker_niceness=0 ray start --head --port=6379",
+    "RAY_worker_niceness=0 ray start --address=HOST:6379",
+)
+#: Set-up and checks, which .ci/run runs as they stand or with all extras and all tests.
+BY_CI = (
+    "python3 -m venv .venv",
+    ".venv/bin/pip install -c constraints.txt -e '.[video]'",
+    ".venv/bin/pip install -c constraints.txt -e '.[dev]'",
+    ".venv/bin/python -m pytest -n 2",
+    ".venv/bin/python -m pytest tests/test_rewards.py",
+    ".venv/bin/python -m ruff check",
+    ".venv/bin/python -m ruff format --check",
+    ".venv/bin/python -m mypy tdgc",
 )
 PROGRAMS = {
     "python": [sys.executable],
     ".venv/bin/python": [sys.executable],
     "tensorboard": [sys.executable, "-m", "tensorboard.main"],
 }
+ENVIRONMENT = r"^[A-Za-z_]+=\S+ "  # a variable set for a command
 
 
-def blocks(language: str) -> list[str]:
-    """README's fenced blocks of one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
+def blocks(text: str, language: str) -> list[str]:
+    """A document's fenced blocks of one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
 
 
-def commands() -> list[str]:
-    """README's shell commands in order, without comments, a chain taken apart."""
-    lines = "".join(blocks("bash")).replace("\\\n", " ").splitlines()
-    bare = [re.sub(r"(^|\s)#.*", "", line) for line in lines]
-    return [part.strip() for line in bare if line.strip() for part in line.split("&&")]
+def commands() -> Iterator[str]:
+    """The shell commands of all documents, without comments, chains taken apart."""
+    for text in TEXT.values():
+        lines = "".join(blocks(text, "bash")).replace("\\\n", " ").splitlines()
+        bare = [re.sub(r"(^|\s)#.*", "", line) for line in lines]
+        yield from (part.strip() for line in bare if line.strip() for part in line.split("&&"))
 
 
-def rows(heading: str) -> list[list[str]]:
-    """Cells of the tables under a heading, without the first one's two head lines."""
-    section = README.split(f"\n## {heading}\n")[1].split("\n## ")[0]
-    lines = [line for line in section.splitlines() if line.startswith("|")]
-    return [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in lines[2:]]
+def tables(name: str, heading: str | None = None) -> list[list[list[str]]]:
+    """Tables of a document, or of a section of it, as rows of cells without the head."""
+    text = TEXT[name]
+    if heading is not None:
+        text = re.split("^## ", text.split(f"\n## {heading}\n")[1], flags=re.MULTILINE)[0]
+    found = re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE)
+    return [
+        [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in table.splitlines()][
+            2:
+        ]
+        for table in found
+    ]
 
 
-def test_every_command_is_in_the_table() -> None:
-    assert list(dict.fromkeys(commands())) == list(COMMANDS)
+def column(table: list[list[str]], index: int = 0) -> list[str]:
+    return [row[index] for row in table]
 
 
-def test_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+# ---------------------------------------------------------------------------- commands
+
+
+def test_every_command_is_run_or_read() -> None:
+    assert set(commands()) == {*RUNS, *READ, *RAY, *BY_CI}
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which commands run as in the repository, and write."""
+    folder = tmp_path_factory.mktemp("workspace")
+    for name in ("train_low.py", "train_high.py", "evaluate.py", "tdgc", "urdf"):
+        (folder / name).symlink_to(ROOT / name)
+    return folder
+
+
+def test_commands_run(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(workspace)
+    for name, text in TEXT.items():
+        for code in blocks(text, "python"):
+            exec(compile(code, name, "exec"), {})  # some write a robot or a terrain
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    monkeypatch.chdir(tmp_path)
-    for code in blocks("python"):
-        exec(compile(code, "README.md", "exec"), {})  # they write a robot and a terrain
 
-    def run(commands: list[str]) -> None:
-        for command in commands:
-            added = str(COMMANDS[command]).format(tmp=tmp_path)
-            program, *arguments = shlex.split(f"{command} {added}")
+    def run(chain: dict[str, Run]) -> None:
+        for command, short in chain.items():
+            program, *arguments = shlex.split(f"{command} {short.added}")
             result = subprocess.run(
                 [*PROGRAMS[program], *arguments],
-                cwd=ROOT,
+                cwd=workspace,
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
@@ -163,27 +251,52 @@ def test_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             )
             output = (result.stdout + result.stderr)[-4000:]
             assert result.returncode == 0, f"{command}\n{output}"
+            left = [name for name in short.leaves if not (workspace / name).exists()]
+            assert not left, f"{command} left no {', '.join(left)}"
 
-    # Two at a time, but those that need what others write, in runs/low and so on, after them.
-    chains: dict[str, list[str]] = {}
-    for command, added in COMMANDS.items():
-        if added is not BY_CI:
-            needs = re.search("{tmp}/(low|a1)", added)
-            chains.setdefault(needs[1] if needs else command, []).append(command)
     with ThreadPoolExecutor(max_workers=2) as pool:
-        list(pool.map(run, chains.values()))
-    outputs = [name.format(map=file_label(f"{tmp_path}/hills.npy")) for name in OUTPUTS]
-    assert not [name for name in outputs if not (tmp_path / name).exists()]
+        list(pool.map(run, CHAINS))
+
+
+@pytest.mark.parametrize("command", READ)
+def test_flags_are_read(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class ReadError(Exception):
+        """All flags were read."""
+
+    parse = argparse.ArgumentParser.parse_args
+
+    def stop(*args: object) -> None:
+        parse(*args)  # type: ignore[call-overload]
+        raise ReadError
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop)
+    _, *arguments = shlex.split(re.sub(ENVIRONMENT, "", command))
+    script, *flags = [word for word in arguments if word != "-m"]
+    with pytest.raises(ReadError):
+        MAINS[script](flags)
+
+
+@pytest.mark.parametrize("command", RAY)
+def test_rays_flags_are_read(command: str) -> None:
+    from ray.scripts.scripts import cli
+
+    _, *arguments = shlex.split(re.sub(ENVIRONMENT, "", command))
+    group = cli.make_context("ray", list(arguments))
+    name, start, rest = cli.resolve_command(group, arguments)
+    assert name == "start" and start.make_context(name, rest, parent=group).params
 
 
 def test_ci_finds_the_test_command() -> None:
-    chains = [
-        line for line in README.splitlines() if re.search("^python3 .* -m pytest -n 2$", line)
-    ]
-    assert len(chains) == 1
+    lines = TEXT["README.md"].splitlines()
+    assert len([line for line in lines if re.search("^python3 .* -m pytest -n 2$", line)]) == 1
+    workflow = ROOT / ".github" / "workflows" / "ci.yml"
+    assert "- run: .ci/run\n" in workflow.read_text(encoding="utf-8")
 
 
-def test_table_of_commands_is_the_decoders() -> None:
+# ---------------------------------------------------------------------------- tables
+
+
+def test_commands_are_the_decoders() -> None:
     decoder = CommandDecoder()
     bounds = zip(decoder.low, decoder.high, strict=True)
     expected = [
@@ -192,27 +305,98 @@ def test_table_of_commands_is_the_decoders() -> None:
             zip(decoder.names, decoder.units, bounds, strict=True)
         )
     ]
-    assert [row[:3] for row in rows("What it is")] == expected
+    assert [row[:3] for row in tables("commands.md")[0]] == expected
+
+
+def test_gaits_are_the_codes() -> None:
+    decoder = CommandDecoder()
+    for row, name in zip(tables("commands.md")[1], GAITS, strict=True):
+        ends = [float(x) for x in row[2].split(" to ")]
+        embedding = [float(x) for x in row[3].split(", ")]
+        assert row[:2] == [name, str(GAITS.index(name))]
+        assert embedding == GAIT_TABLE[GAITS.index(name)].tolist()
+        inside = [0.0] * 12 + [sum(ends) / 2.0]
+        assert decoder.gait(inside) == GAITS.index(name)
+        assert decoder.gait([0.0] * 12 + [ends[0]]) == GAITS.index(name)
+
+
+def test_observations_are_as_wide_as_the_policies() -> None:
+    for table, name in zip(tables("commands.md", "Observations"), ("low", "high"), strict=True):
+        assert sum(map(int, column(table, 1))) == policies.load(PRETRAINED / name).actor_dim
+
+
+def test_families_are_the_terrains() -> None:
+    table = tables("benchmark.md")[0]
+    assert tuple(column(table)) == ALL_FAMILIES
+    for family, _, first, last in table[:-1]:
+        assert (float(first.split()[0]), float(last.split()[0])) == PARAMETER_RANGES[family]
+
+
+def test_conditions_are_the_benchmarks() -> None:
+    assert column(tables("benchmark.md", "Protocol")[0]) == list(CONDITIONS)
 
 
 @pytest.mark.parametrize(
-    ("heading", "main"), [("Train", train_low.main), ("Evaluate", evaluate.main)]
+    ("name", "heading", "main"),
+    [
+        ("train.md", "The low policy", calibration.main),
+        ("train.md", "Flags", train_high.main),
+        ("evaluate.md", None, evaluate.main),
+        ("deploy.md", "Export", export.main),
+        ("scaling.md", "Measure it", bench.main),
+    ],
 )
-def test_table_of_flags_is_the_scripts(
-    heading: str, main: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str]
+def test_flags_are_the_scripts(
+    name: str,
+    heading: str | None,
+    main: Callable[[list[str]], int],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    assert column(tables(name, heading)[0]) == flags(main, capsys)
+
+
+def test_both_trainers_take_the_same_flags(capsys: pytest.CaptureFixture[str]) -> None:
+    both, low = flags(train_high.main, capsys), flags(train_low.main, capsys)
+    assert both == [*low, "--low", "--preset"]
+
+
+def flags(main: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The flags in a script's help, in order."""
     with pytest.raises(SystemExit):
         main(["--help"])
-    flags = re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, flags=re.MULTILINE)
-    assert [row[0] for row in rows(heading) if re.match("--[a-z]", row[0])] == flags
+    return re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, flags=re.MULTILINE)
 
 
-def test_conditions_are_named() -> None:
-    assert not [name for name in CONDITIONS if f"`{name}`" not in README]
+# ---------------------------------------------------------------------------- what they name
 
 
-def test_map_names_what_is_there() -> None:
-    named = {row[0] for row in rows("Repository map")}
-    assert not [name for name in named if not (ROOT / name).exists()]
-    modules = [*ROOT.glob("*.py"), *(ROOT / "tdgc").rglob("[a-z]*.py")]
-    assert not {str(path.relative_to(ROOT)) for path in modules} - named
+def test_rooms_are_in_order() -> None:
+    named = [
+        path.removeprefix("tdgc/").rstrip("/").removesuffix(".py")
+        for row in tables("CONTRIBUTING.md", "Where things are")[0]
+        for path in re.findall(r"[\w./]+", row[0])
+    ]
+    rooms = [name for name in named if name in FLOOR]
+    assert {*rooms, "tdgc"} == FLOOR.keys()
+    assert [FLOOR[name] for name in rooms] == sorted(FLOOR[name] for name in rooms)
+    assert set(named) - set(rooms) == {"pretrained", "urdf"}
+    assert not [door for door in DOORS if f"`tdgc.{door}`" not in TEXT["CONTRIBUTING.md"]]
+
+
+@pytest.mark.parametrize("name", TEXT)
+def test_what_is_named_is_there(name: str) -> None:
+    text, folder = TEXT[name], ROOT if (ROOT / name).is_file() else ROOT / "docs"
+    paths = re.findall(r"(?:tdgc|docs|tests|urdf|\.ci)/[\w/.-]*\w", text)
+    made = ("tdgc/LowLevel-v0", "tdgc/Navigation-v0", "docs/robot.gif")
+    links = [link.partition("#")[0] for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text)]
+    missing = [p for p in paths if p not in made and not (ROOT / p).exists()]
+    missing = [p for p in missing if not (ROOT / f"{p}.json").is_file()]  # a policy, no suffix
+    missing += [p for p in links if p and p not in made and not (folder / p).exists()]
+    assert not missing
+
+
+def test_extras_are_in_setup() -> None:
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg", encoding="utf-8")
+    named = {extra for text in TEXT.values() for extra in re.findall(r"'\.\[(\w+)\]'", text)}
+    assert named <= set(setup["options.extras_require"])

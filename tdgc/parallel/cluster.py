@@ -1,6 +1,6 @@
 """Workers on more than one machine: actors and tasks of Ray, the extra ``cluster``.
 
-Ray runs on each machine already, see docs/scaling.md. This process joins it, and Ray decides which
+Ray runs on each machine already, see docs/cluster.md. This process joins it, and Ray decides which
 machine a worker or a batch of episodes goes to. Nothing else here knows Ray, and nothing imports
 it before it is asked for.
 """

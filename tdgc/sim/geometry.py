@@ -79,7 +79,7 @@ def read_geometry(config: RobotConfig) -> Geometry:
     """The geometry of the robot whose URDF ``config`` names.
 
     It is read anew at each call, as Bullet reads it for each robot: a world reads it once and
-    keeps it. README, "Your own robot", says what a URDF must have.
+    keeps it. docs/robot.md says what a URDF must have.
 
     Raises:
         ConfigError: a file that is not there, cannot be read or is no robot of this kind; the
