@@ -27,7 +27,8 @@ from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.show import plots
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.low_env import LowLevelTask, make_task, summarise
+from tdgc.tasks.low_env import LowLevelTask, make_task
+from tdgc.tasks.low_statistics import summarise
 from tdgc.tasks.tiles import check_families
 
 

@@ -40,7 +40,7 @@ from tdgc.errors import InputError
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
-from tdgc.parallel.vec import TaskVecEnv
+from tdgc.parallel.vec import TaskVecEnv, lasting
 from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
 from tdgc.sim.robot import NUM_JOINTS
@@ -58,13 +58,9 @@ _TURNS = 10  # of each place in a comparison
 
 def spread_levels(env: TaskVecEnv, levels: int) -> None:
     """New episodes for all robots, spread over the levels as a training's are."""
-    lasting = ("rng", "tiles_drawn", "command_share", "restarts")
     env.load_state_dicts(
         [
-            {
-                **{key: state[key] for key in lasting},
-                "level": np.arange(len(state["level"])) % levels,
-            }
+            {**lasting(state), "level": np.arange(len(state["level"])) % levels}
             for state in env.state_dicts()
         ]
     )

@@ -295,7 +295,7 @@ class Poisoned(LowLevelTask):
 
     def restart(self) -> None:
         super().restart()
-        self.elapsed[:] = 0  # so that no episode ends here
+        self.episodes.elapsed[:] = 0  # so that no episode ends here
 
 
 def make_poisoned(robots: int, seed: int) -> Poisoned:

@@ -354,7 +354,7 @@ def test_the_future_follows_from_the_state(episodes, guided):
         for _ in range(5):
             first.step(rng.uniform(-1, 1, (3, 13)))
         first._next_push[0] = 0
-        first._push()
+        first._pushes.push(first.locomotion.world, first.elapsed, np.ones(first.num_robots))
         first.tiles.episodes[:] = 5  # so the next ones bring new tiles
         state = first.state_dict()
         if episodes:

@@ -22,7 +22,9 @@ from tdgc.sim.locomotion import (
 from tdgc.sim.robot import Array, commanded_pose, nominal_pose
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, Tile, make_tile
-from tdgc.tasks.low_env import CRITIC_LAYOUT, LowLevelTask
+from tdgc.tasks.critic import CRITIC_LAYOUT
+from tdgc.tasks.ground import measure_ground
+from tdgc.tasks.low_env import LowLevelTask
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig(substeps=4)
 NOMINAL = nominal_pose(ROBOT)
@@ -421,7 +423,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
             joints[1] = mirrored(joints[0], (swap, flip))
         state.foot_force[1] = state.foot_force[0, [1, 0, 3, 2]]
         state.derive()
-        task._ground = task._measure_ground()
+        task.ground = measure_ground(task.locomotion)
         first, second = task.observe()
         np.testing.assert_allclose(second, mirrored(first, task.observation_mirror), atol=1e-4)
     critic, where = first[task.actor_dim :], slices(CRITIC_LAYOUT)

@@ -35,7 +35,6 @@ from tdgc.tasks import rewards
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.leaps import Landing
-from tdgc.tasks.low_env import TaskEnv
 from tdgc.tasks.probes import (
     NUM_PROBES,
     PROBE_RANGE,
@@ -43,7 +42,9 @@ from tdgc.tasks.probes import (
     PROBES,
     HeightProbes,
 )
+from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, has_failed, outcome
+from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.teacher import Teacher
 from tdgc.tasks.tiles import TrainingTiles
 
@@ -280,6 +281,8 @@ class NavigationTask:
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._reached_at = np.full(m, -1)
         self._next_push = np.zeros(m)
+        disturbed = config.randomisation, self.rng, self.step_seconds
+        self._pushes = Pushes(*disturbed, self._next_push)
         self._actions = np.zeros((2, m, NUM_ACTIONS))
         self._commands = np.zeros((3, m, 15))
         self.stats: dict[str, float] = {}
@@ -320,7 +323,7 @@ class NavigationTask:
         if self.training:
             width = self._width()[index]
             self.locomotion.randomise(index, self.config.randomisation, rng, width)
-            self._schedule_push(index)
+            self._pushes.schedule(index, self.elapsed)
         self._actions[:, index] = 0.0
         middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
         self._commands[:, index] = command_share(middle, self.decoder)
@@ -396,7 +399,7 @@ class NavigationTask:
             own = done[~self._led[done]]  # the teacher's episodes say nothing of the policy
             if own.size:
                 self.curriculum.push(own, reached[own])
-            self._push()
+            self._pushes.push(loco.world, self.elapsed, self._width())
         return reward, failed, truncated
 
     def observe(self) -> NDArray[np.float32]:
@@ -431,24 +434,6 @@ class NavigationTask:
             place = np.arange(self.num_robots) // len(self.config.families)
             told[place >= each * (1.0 - self.config.unknown_share)] = len(FAMILIES)
         return told
-
-    # ------------------------------------------------------------------ disturbances
-
-    def _schedule_push(self, index: NDArray[np.integer]) -> None:
-        wait = self.rng.uniform(*self.config.randomisation.push_interval, len(index))
-        self._next_push[index] = self.elapsed[index] + wait / self.step_seconds
-
-    def _push(self) -> None:
-        index = np.flatnonzero(self.elapsed >= self._next_push)
-        if not index.size:
-            return
-        r = self.config.randomisation
-        angle = self.rng.uniform(-np.pi, np.pi, index.size)
-        top = r.scale * r.push_speed * self._width()[index]
-        speed = top * self.rng.uniform(size=index.size)
-        velocity = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-        self.locomotion.world.push(index, speed[:, None] * velocity)
-        self._schedule_push(index)
 
     # ------------------------------------------------------------------ statistics, resume
 
