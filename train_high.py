@@ -30,7 +30,15 @@ from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.high_env import NavigationTask, high_mirror, load_low, paired, summarise
+from tdgc.sim.world import check_robot
+from tdgc.tasks.high_env import (
+    NavigationTask,
+    high_mirror,
+    high_spaces,
+    load_low,
+    paired,
+    summarise,
+)
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.teacher import check_styles
 from tdgc.tasks.tiles import check_families
@@ -65,18 +73,15 @@ def build(
     env_config = config.env
     if config.imitation.steps:  # what was imitated on all levels goes on on all
         env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
-    probe = NavigationTask(env_config, low, 1, seed=0, guided=guided)
-    spaces = probe.observation_space, probe.action_space
     landing = None
     if guided and "gap" in env_config.families:
-        landing = measure_landing(low, probe.low_config)
-    probe.close()
+        landing = measure_landing(*load_low(low))
     env = TaskVecEnv(
         functools.partial(NavigationTask, env_config, low, guided=guided, landing=landing),
         config.n_envs,
         config.workers,
         config.seed,
-        spaces,
+        high_spaces(env_config, bool(guided)),
         recover=True,
         timeout=timeout,
         link=link,
@@ -132,6 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = configure(HighTrainConfig(), args)
         low, low_config = load_low(config.low)
+        check_robot(low_config.robot, low_config.physics)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check_families(config.env.families)
         unknown = config.env.unknown_share

@@ -24,10 +24,14 @@ from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, to_dict
 from tdgc.learn.training import Interruption, Phase, add_arguments, configure, run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
-from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
+from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.show import plots
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import width
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.low_env import LowLevelTask, make_task
+from tdgc.sim.world import check_robot
+from tdgc.tasks.low_env import make_task
+from tdgc.tasks.low_observation import low_mirror, low_spaces
 from tdgc.tasks.low_statistics import summarise
 from tdgc.tasks.tiles import check_families
 
@@ -93,21 +97,18 @@ def build(
     link: MakeLink,
 ) -> tuple[PPO, TaskVecEnv]:
     """Workers and learner of one phase."""
-    probe = LowLevelTask(env_config[0], 1, seed=0)
     env = TaskVecEnv(
         functools.partial(make_task, env_config, config.plane_share),
         config.n_envs,
         config.workers,
         config.seed,
-        (probe.observation_space, probe.action_space),
+        low_spaces(config.env),
         recover=True,
         timeout=timeout,
         link=link,
     )
     ppo = config.ppo
     first, last = ppo.learning_rate, ppo.final_learning_rate
-    (obs_index, obs_sign), (act_index, act_sign) = probe.observation_mirror, probe.action_mirror
-    mirror = Mirror(*(tuple(x.tolist()) for x in (obs_index, obs_sign, act_index, act_sign)))
 
     def learning_rate(remaining: float) -> float:
         """Linear over the run, times the exploration noise: see ``PPOConfig``."""
@@ -129,8 +130,8 @@ def build(
         vf_coef=ppo.vf_coef,
         max_grad_norm=ppo.max_grad_norm,
         policy_kwargs={
-            "actor_dim": probe.actor_dim,
-            "mirror": mirror if ppo.mirror else None,
+            "actor_dim": width(actor_layout(config.env.gyro)),
+            "mirror": low_mirror(config.env) if ppo.mirror else None,
             "net_arch": {"pi": list(ppo.actor), "vf": list(ppo.critic)},
             "optimizer_kwargs": {"eps": ppo.adam_eps},
             "activation_fn": policies.ACTIVATIONS[ppo.activation],
@@ -140,7 +141,6 @@ def build(
         device=device,
     )
     built = True
-    probe.close()
     return model, env
 
 
@@ -151,6 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = configure(LowTrainConfig(), args)
         check_families(config.env.families)
+        check_robot(config.env.robot, config.env.physics)
         meta = {
             "config": to_dict(config.env),
             "seed": config.seed,

@@ -16,12 +16,13 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.sim.commands import INDEX, default_command, gait_index
 from tdgc.sim.gaits import gait_embedding
+from tdgc.sim.observation import columns, width
 from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import make_tile, tile_rng
 from tdgc.state import State, split
-from tdgc.tasks.critic import CRITIC_LAYOUT
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask
+from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_spaces
 from tdgc.tasks.low_statistics import summarise
 from tdgc.tasks.rules import is_fallen
 from tdgc.tasks.tiles import shallow
@@ -99,14 +100,15 @@ def test_an_action_that_is_not_finite(value: float) -> None:
 
 
 def test_observation_of_actor_and_critic() -> None:
+    """Sizes follow from the terms, without a robot."""
+    assert width(CRITIC_LAYOUT) == 40
+    without = low_spaces(dataclasses.replace(PLANE, gyro=False))[0]
+    assert without.shape == (111,)
     task = LowLevelTask(PLANE, 3, seed=0)
     assert task.actor_dim == 74
-    assert task.obs_dim == 74 + sum(size for _, size in CRITIC_LAYOUT) == 114
+    assert (task.observation_space, task.action_space) == low_spaces(PLANE)
     task.reset(np.arange(3))
     assert task.observe().shape == (3, 114) and task.observe().dtype == np.float32
-    task.close()
-    task = LowLevelTask(dataclasses.replace(PLANE, gyro=False), 1, seed=0)
-    assert task.actor_dim == 71 and task.obs_dim == 111
     task.close()
 
 
@@ -123,12 +125,8 @@ def test_only_the_actor_has_noise_and_only_in_training() -> None:
 
 
 def critic(task: LowLevelTask) -> dict[str, Array]:
-    rows, parts, start = task.observe(), {}, task.actor_dim
-    for name, size in CRITIC_LAYOUT:
-        parts[name] = rows[:, start : start + size]
-        start += size
-    assert start == task.obs_dim
-    return parts
+    rows = task.observe()[:, task.actor_dim :]
+    return {name: rows[:, where] for name, where in columns(CRITIC_LAYOUT).items()}
 
 
 def test_what_the_critic_sees_of_a_known_state() -> None:

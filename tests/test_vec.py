@@ -247,14 +247,14 @@ from pathlib import Path
 import torch
 from tdgc.config import LowLevelConfig
 from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import low_spaces
 from tdgc.parallel.vec import TaskVecEnv
 
 class Own(LowLevelTask):
     pass
 
 if __name__ == "__main__":
-    probe = LowLevelTask(LowLevelConfig(), 1, 0)
-    spaces = probe.observation_space, probe.action_space
+    spaces = low_spaces(LowLevelConfig())
     for task in (LowLevelTask, Own):
         env = TaskVecEnv(functools.partial(task, LowLevelConfig()), 1, 1, 0, spaces)
         print("libtorch" in Path(f"/proc/{env.worker_pids[0]}/maps").read_text())

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,18 +16,19 @@ from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.worker import Task
 from tdgc.sim.commands import gait_index
 from tdgc.sim.gaits import GAITS, gait_embedding
-from tdgc.sim.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
-from tdgc.sim.robot import NUM_JOINTS, Array
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.observation import observe, width
+from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, draw_start_goal
 from tdgc.state import State, copies, fill
 from tdgc.tasks import rewards
 from tdgc.tasks.command_draw import CommandDraw
-from tdgc.tasks.critic import CRITIC_LAYOUT, CRITIC_MIRRORS, observe_critic
 from tdgc.tasks.crossings import Crossings
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.leaps import Landing
+from tdgc.tasks.low_observation import CRITIC_LAYOUT, Seen, low_spaces
 from tdgc.tasks.low_statistics import Sums, by_gait
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import is_fallen
@@ -91,14 +91,8 @@ class LowLevelTask:
         self._noise = Noise(config.randomisation, self.rng) if training else None
         self._build()
         self.stats = Sums()
-        layout = self.locomotion.layout
-        self.actor_dim = sum(size for _, size in layout)
-        self.obs_dim = self.actor_dim + sum(size for _, size in CRITIC_LAYOUT)
-        self.observation_mirror = mirror_map(layout + CRITIC_LAYOUT, MIRRORS | CRITIC_MIRRORS)
-        self.action_mirror = action_mirror()
-        limit = config.robot.action_limit
-        self.action_space = gym.spaces.Box(-limit, limit, (NUM_JOINTS,), np.float32)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
+        self.actor_dim = width(self.locomotion.layout)
+        self.observation_space, self.action_space = low_spaces(config)
 
     def _build(self) -> None:
         """Draw all tiles and build the world."""
@@ -245,10 +239,10 @@ class LowLevelTask:
         return np.where(self.crossings.flat, mine, c.terrain_penalty)
 
     def observe(self) -> NDArray[np.float32]:
-        """(M, obs_dim): the actor's part, noisy in training, and the critic's."""
+        """(M, n): the actor's part, noisy in training, and the critic's."""
         actor = self.locomotion.observe(self._noise)
-        critic = observe_critic(self.locomotion, self.ground)
-        return np.concatenate([actor, critic], axis=1).astype(np.float32)
+        critic = observe(CRITIC_LAYOUT, Seen(self.locomotion, self.ground))
+        return np.concatenate([actor, critic], axis=1)
 
     # ------------------------------------------------------------------ statistics, resume
 
