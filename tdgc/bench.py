@@ -39,7 +39,7 @@ from tdgc.errors import InputError
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
-from tdgc.parallel.vec import TaskVecEnv, lasting
+from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy
 from tdgc.sim.locomotion import actor_layout
@@ -62,7 +62,7 @@ def spread_levels(env: TaskVecEnv, levels: int) -> None:
     """New episodes for all robots, spread over the levels as a training's are."""
     env.load_state_dicts(
         [
-            {**lasting(state), "level": np.arange(len(state["level"])) % levels}
+            {**without_episodes(state), "level": np.arange(len(state["level"])) % levels}
             for state in env.state_dicts()
         ]
     )

@@ -247,7 +247,7 @@ class LowLevelTask:
     # ------------------------------------------------------------------ statistics, resume
 
     def _count(self, terms: dict[str, Array], reward: Array, terminated: NDArray[np.bool_]) -> None:
-        """Add this step to ``stats`` (``tdgc.learn`` divides and logs them)."""
+        """Add this step to ``stats`` (``tdgc.learn.run`` divides and logs them)."""
         add = self.stats.add
         add("steps", self.num_robots)
         add("minutes", self.num_robots * self.config.physics.control_dt / 60.0)
