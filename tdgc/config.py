@@ -197,10 +197,10 @@ class RandomisationConfig:
 
 @dataclass(frozen=True)
 class CommandDrawConfig:
-    """Commands drawn in training, uniform within their ranges: those of a crossing see below, the
-    others lead anywhere."""
+    """Commands drawn in training, uniform within their ranges, and the curriculum that widens the
+    velocity ranges of each gait."""
 
-    # Trot is what crossings are mostly made in, so free commands have it less often.
+    # Of free commands, which lead anywhere. Trot is what crossings are mostly made in.
     gaits: GaitShares = (0.2, 0.2, 0.3, 0.3)
     standing: Share = 0.1  # with no velocity: stepping on the spot is asked for at every goal
     # Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet
@@ -209,21 +209,15 @@ class CommandDrawConfig:
     leaps: Share = 0.05
     leap_vx: Range = (0.85, 1.0)  # shares of the range: 0.7-1 m/s
     leap_frequency: Range = (0.0, 0.375)  # shares of the range: 2-2.75 Hz
-
-
-@dataclass(frozen=True)
-class CommandGrowthConfig:
-    """The command curriculum: a gait's velocity ranges grow when it was tracked well."""
-
-    step: float = 0.05  # of the whole ranges, each time
-    steps: int = 200  # control steps of all robots (4 s), shared by the gaits, that are judged
+    growth: float = 0.05  # of the whole ranges, when a gait was tracked well
+    growth_steps: int = 200  # control steps of all robots, 4 s, after which a gait is judged
     # Shares of what perfect tracking earns: errors of about 0.26 m/s and 0.32 rad/s at the default
     # sigmas.
-    velocity: Share = 0.5
-    yaw_rate: Share = 0.5
+    growth_velocity: Share = 0.5
+    growth_yaw_rate: Share = 0.5
     # Share of feet in contact as desired: speed comes after gait. At 0.8 bound never left its first
     # ranges, since its rear feet lift late, and then undershot every faster command.
-    contact: Share = 0.7
+    growth_contact: Share = 0.7
 
 
 @dataclass(frozen=True)
@@ -269,15 +263,11 @@ class LowLevelConfig:
     robot: RobotConfig = field(default_factory=RobotConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     commands: CommandRanges = field(default_factory=CommandRanges)
-    # These three stood in the code before they were configuration. Where a default of theirs
-    # changes, what it was must be written here.
+    # These two stood in the code before they were configuration. Where a default of theirs changes,
+    # what it was must be written here.
     command_draw: CommandDrawConfig = field(
         default_factory=CommandDrawConfig,
         metadata={"before": dataclasses.asdict(CommandDrawConfig())},
-    )
-    command_growth: CommandGrowthConfig = field(
-        default_factory=CommandGrowthConfig,
-        metadata={"before": dataclasses.asdict(CommandGrowthConfig())},
     )
     crossing: CrossingConfig = field(
         default_factory=CrossingConfig, metadata={"before": dataclasses.asdict(CrossingConfig())}

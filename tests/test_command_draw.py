@@ -19,7 +19,7 @@ def make(training: bool, command_start: float = 0.4) -> CommandDraw:
 
 def drawn(draw: CommandDraw, n: int) -> tuple[Array, Array]:
     """Gaits and values of n free commands."""
-    return draw.draw(draw.bounds(n), np.ones(n, dtype=bool))
+    return draw.draw(*draw.bounds(n), np.ones(n, dtype=bool))
 
 
 def test_commands_fill_their_ranges() -> None:
@@ -41,7 +41,7 @@ def test_leaps_are_fast_and_slow_in_step_and_free_commands_only() -> None:
     )
     draw = CommandDraw(config, np.random.default_rng(0), training=False)
     free = np.arange(200) < 100
-    gaits, values = draw.draw(draw.bounds(200), free)
+    gaits, values = draw.draw(*draw.bounds(200), free)
     assert (gaits[free] == 1).all() and not (gaits[~free] == 1).all()
     vx, frequency = values[:, INDEX["vx"]], values[:, INDEX["frequency"]]
     assert (vx[free] >= 0.7).all() and vx[~free].min() < -0.5

@@ -63,16 +63,15 @@ def test_what_was_recorded_must_be_whole() -> None:
 def test_a_run_from_before_the_task_was_configured() -> None:
     """Its numbers stood in the code; these are what they were, whatever the defaults are now."""
     data = to_dict(LowLevelConfig())
-    for key in ("first_levels", "command_draw", "command_growth", "crossing"):
+    for key in ("first_levels", "command_draw", "crossing"):
         del data[key]
     then = to_dict(recorded(LowLevelConfig, data, "run"))
     assert then["first_levels"] == 3
     assert then["command_draw"] == {
         "gaits": [0.2, 0.2, 0.3, 0.3], "standing": 0.1,
         "leaps": 0.05, "leap_vx": [0.85, 1.0], "leap_frequency": [0.0, 0.375],
-    }  # fmt: skip
-    assert then["command_growth"] == {
-        "step": 0.05, "steps": 200, "velocity": 0.5, "yaw_rate": 0.5, "contact": 0.7
+        "growth": 0.05, "growth_steps": 200, "growth_velocity": 0.5, "growth_yaw_rate": 0.5,
+        "growth_contact": 0.7,
     }  # fmt: skip
     assert then["crossing"] == {
         "share": 0.8, "gaits": [0.8, 0.05, 0.075, 0.075], "trench_gaits": [0.15, 0.85, 0.0, 0.0],

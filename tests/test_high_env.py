@@ -313,7 +313,7 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
     try:
         task.reset(np.arange(40))
         size = width(high_layout("both"))
-        assert task.actor_dim == size and task.observation_space.shape == (size + 13,)
+        assert task.observation_space.shape == (size + 13,)
         led = []
         for _ in range(8):
             led.append(task._led.mean())

@@ -418,7 +418,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
         task.ground = measure_ground(task.locomotion)
         first, second = task.observe()
         np.testing.assert_allclose(second, mirrored(first, ALL), atol=1e-4)
-    critic, where = first[task.actor_dim :], columns(CRITIC_LAYOUT)
+    critic, where = first, columns((*loco.layout, *CRITIC_LAYOUT))
     # What is compared is not all alike, neither left to right nor along x.
     probes = critic[where["terrain"]].reshape(5, 3)
     assert np.abs(probes[:, 0] - probes[:, 2]).max() > 0.04 and np.ptp(probes[:, 1]) > 0.2

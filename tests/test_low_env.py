@@ -105,7 +105,6 @@ def test_observation_of_actor_and_critic() -> None:
     without = low_spaces(dataclasses.replace(PLANE, gyro=False))[0]
     assert without.shape == (111,)
     task = LowLevelTask(PLANE, 3, seed=0)
-    assert task.actor_dim == 74
     assert (task.observation_space, task.action_space) == low_spaces(PLANE)
     task.reset(np.arange(3))
     assert task.observe().shape == (3, 114) and task.observe().dtype == np.float32
@@ -125,8 +124,8 @@ def test_only_the_actor_has_noise_and_only_in_training() -> None:
 
 
 def critic(task: LowLevelTask) -> dict[str, Array]:
-    rows = task.observe()[:, task.actor_dim :]
-    return {name: rows[:, where] for name, where in columns(CRITIC_LAYOUT).items()}
+    rows, where = task.observe(), columns((*task.locomotion.layout, *CRITIC_LAYOUT))
+    return {term.name: rows[:, where[term.name]] for term in CRITIC_LAYOUT}
 
 
 def test_what_the_critic_sees_of_a_known_state() -> None:
@@ -608,7 +607,7 @@ def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> 
         task.level[:], task.episodes.crossing[:] = level, [True, False]
         wide = task.commands.bounds(2)
         _, low, high = narrowed = task.commands.bounds(2)
-        task.crossings.narrow(np.arange(2), task.level, narrowed)
+        task.crossings.narrow(np.arange(2), task.level, *narrowed)
         np.testing.assert_allclose(low[0, columns], [b[0] for b in bounds], atol=1e-12)
         np.testing.assert_allclose(high[0, columns], [b[1] for b in bounds], atol=1e-12)
         for left, before in zip(narrowed, wide, strict=True):
@@ -768,6 +767,26 @@ def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
         assert flat(other.state_dict()) == flat(task.state_dict())
     task.close()
     other.close()
+
+
+def test_a_checkpoint_names_what_it_holds() -> None:
+    """Runs are resumed by later versions, so names, sizes and kinds of numbers stay."""
+    task = begin(TILES, 3, training=True)
+    state = task.state_dict()
+    episodes = state.pop("episodes")
+    for part in ("locomotion", "tiles"):
+        assert episodes.pop(part)
+    assert set(state) == {"rng", "landing", "tiles_drawn", "level", "command_share"}
+    assert len(state["landing"]) == 2 and state["command_share"].shape == (4,)
+    held = {name: f"{array.dtype} {array.shape}" for name, array in episodes.items()}
+    whole, flags, numbers = "int64 (3,)", "bool (3,)", "float64 (3,)"
+    assert held == {
+        "elapsed": whole, "began": whole, "next_push": whole,
+        "crossing": flags, "leaping": flags, "reached": flags, "was_contact": "bool (3, 4)",
+        "speed": numbers, "follow": numbers, "pitch": numbers, "facing": numbers,
+        "waypoint": "float64 (3, 2)", "origin": "float64 (3, 2)", "gait_scores": "float64 (4, 4)",
+    }  # fmt: skip
+    task.close()
 
 
 def test_new_episodes_begin_from_a_state_without_any() -> None:

@@ -35,7 +35,6 @@ class Counter:
     its actions.
     """
 
-    actor_dim = 3
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +15,6 @@ from tdgc.sim.robot import Array
 # Of ``low_statistics.by_gait``, what a gait is judged by: samples, and sums over them.
 _JUDGED = ("steps", "track_lin_vel", "track_yaw_rate", "match")
 PRONK = GAITS.index("pronk")
-
-
-class CommandBounds(NamedTuple):
-    """What commands of n robots are drawn from.
-
-    Attributes:
-        gaits: (n, 4) probability of each gait.
-        low, high: (n, 12) bounds of the continuous commands, velocities not yet scaled.
-    """
-
-    gaits: Array
-    low: Array
-    high: Array
 
 
 class CommandDraw:
@@ -53,25 +39,28 @@ class CommandDraw:
         self.share = np.full(len(GAITS), config.command_start if training else 1.0)
         self.scores = np.zeros((len(GAITS), 4))
 
-    def bounds(self, n: int) -> CommandBounds:
-        """Of free commands for n robots."""
-        ranges = (self._config.command_draw.gaits, self._low, self._high)
-        return CommandBounds(*(np.tile(each, (n, 1)) for each in ranges))
+    def bounds(self, n: int) -> tuple[Array, Array, Array]:
+        """What n free commands are drawn from: probabilities of the gaits, (n, 4), and lower and
+        upper bounds of the continuous commands, (n, 12), of the velocities before they grow."""
+        gaits, low, high = (
+            np.tile(each, (n, 1))
+            for each in (self._config.command_draw.gaits, self._low, self._high)
+        )
+        return gaits, low, high
 
     def draw(
-        self, bounds: CommandBounds, free: NDArray[np.bool_]
+        self, gaits: Array, low: Array, high: Array, free: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], Array]:
-        """Gaits (n,) and continuous commands (n, 12); of the ``free`` ones (n,) some leap."""
+        """Gaits (n,) and continuous commands (n, 12) from such ``bounds``; of the ``free`` ones
+        (n,) some leap."""
         n, rng, config = len(free), self._rng, self._config.command_draw
-        cumulated = np.cumsum(bounds.gaits, axis=1)[:, :-1]
-        gait = np.sum(rng.uniform(size=(n, 1)) > cumulated, axis=1)
-        values = rng.uniform(bounds.low, bounds.high)
+        gait = np.sum(rng.uniform(size=(n, 1)) > np.cumsum(gaits, axis=1)[:, :-1], axis=1)
+        values = rng.uniform(low, high)
         leap = free & (rng.uniform(size=n) < config.leaps)
         gait[leap] = PRONK
-        low, span = bounds.low[leap], (bounds.high - bounds.low)[leap]
         for name, shares in (("vx", config.leap_vx), ("frequency", config.leap_frequency)):
-            j = INDEX[name]
-            values[leap, j] = low[:, j] + rng.uniform(*shares, len(low)) * span[:, j]
+            j, share = INDEX[name], rng.uniform(*shares, int(leap.sum()))
+            values[leap, j] = low[leap, j] + share * (high - low)[leap, j]
         values[:, :3] *= self.share[gait][:, None]
         values[rng.uniform(size=n) < config.standing, :3] = 0.0
         return gait, values
@@ -79,15 +68,15 @@ class CommandDraw:
     def judge(self, sums: Mapping[str, Array], num_robots: int) -> None:
         """Add the sums of a step of M robots, as ``by_gait`` has them; widen the velocity ranges of
         a gait that was tracked well over enough of them, and judge it from the next step on."""
-        growth, weights = self._config.command_growth, self._config.rewards
+        config, weights = self._config.command_draw, self._config.rewards
         self.scores += np.stack([sums[name] for name in _JUDGED], axis=1)
-        for g in np.flatnonzero(self.scores[:, 0] >= growth.steps * num_robots / len(GAITS)):
+        for g in np.flatnonzero(self.scores[:, 0] >= config.growth_steps * num_robots / len(GAITS)):
             samples, velocity, yaw_rate, contact = self.scores[g]
-            good = velocity / samples > growth.velocity * weights.track_lin_vel
-            good &= yaw_rate / samples > growth.yaw_rate * weights.track_yaw_rate
-            good &= contact / samples > growth.contact
+            good = velocity / samples > config.growth_velocity * weights.track_lin_vel
+            good &= yaw_rate / samples > config.growth_yaw_rate * weights.track_yaw_rate
+            good &= contact / samples > config.growth_contact
             if good and self._training:
-                self.share[g] = min(1.0, self.share[g] + growth.step)
+                self.share[g] = min(1.0, self.share[g] + config.growth)
             self.scores[g] = 0.0
 
     def grown(self) -> Array:

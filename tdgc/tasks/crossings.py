@@ -16,7 +16,7 @@ from tdgc.sim.commands import CONTINUOUS, INDEX
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import MAX_LEVEL, TILE_SIZE, TileField
-from tdgc.tasks.command_draw import PRONK, CommandBounds
+from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import Ground
 from tdgc.tasks.leaps import SWING_HEIGHT, Landing, LeapPlan
@@ -79,19 +79,19 @@ class Crossings:
         e.crossing[index] = drawn & ~self.flat[index]
 
     def narrow(
-        self, index: NDArray[np.integer], levels: NDArray[np.integer], bounds: CommandBounds
+        self, index: NDArray[np.integer], levels: Ints, gaits: Array, low: Array, high: Array
     ) -> None:
-        """Narrow ``bounds`` of the robots ``index`` (n,) in place, of those that cross.
+        """Narrow, in place, what commands of the robots ``index`` (n,) are drawn from, see
+        ``CommandDraw.bounds``, where they cross tiles of their ``levels`` (M,).
 
         A foot that must clear a 15 cm step, or a trunk that bends away from a 0.4 rad slope, cannot
-        follow the rest and learns nothing from it. ``levels`` is (M,).
+        follow the rest and learns nothing from it.
         """
         c, crossing = self._config, self._episodes.crossing[index]
-        bounds.gaits[crossing] = c.gaits
-        bounds.gaits[crossing & self.leapers[index]] = c.trench_gaits
+        gaits[crossing] = c.gaits
+        gaits[crossing & self.leapers[index]] = c.trench_gaits
         d = np.where(crossing, levels[index] / MAX_LEVEL, 0.0)
         swing, height, bend = INDEX["swing_height"], INDEX["body_height"], [_PITCH, INDEX["roll"]]
-        low, high = bounds.low, bounds.high
         clearance = c.clearance[0] + d * (c.clearance[1] - c.clearance[0])
         low[:, swing] = np.minimum(low[:, swing] + crossing * clearance, high[:, swing])
         low[:, height] *= 1.0 - d

@@ -9,38 +9,25 @@ from numpy.typing import NDArray
 
 
 class Episodes:
-    """Arrays with a row per robot, all zero where an episode begins.
-
-    Attributes:
-        elapsed, began: (M,) control steps, and how many there were when the episode began.
-        next_push: (M,) ``elapsed`` at the next push.
-        crossing: (M,) whether a robot crosses its tile; it has free commands otherwise.
-        speed: (M,) m/s of a crossing.
-        leaping: (M,) whether a crossing leaps over its trenches.
-        follow: (M,) share of the slope under a robot that the pitch of its crossing follows.
-        pitch: (M,) rad, that is added to it.
-        facing: (M,) rad, heading of a crossing against the bearing of its waypoint.
-        waypoint: (M, 2) m in the world, where a crossing leads.
-        reached: (M,) whether it got there.
-        was_contact: (M, 4) foot contacts at the last step.
-        origin: (M, 2) m in the world, corner of the tile; zero on a plane.
-    """
+    """Arrays with a row per robot, all zero where an episode begins; checkpoints hold them by
+    name."""
 
     def __init__(self, num_robots: int) -> None:
         m = num_robots
-        self.elapsed = np.zeros(m, dtype=np.int64)
-        self.began = np.zeros(m, dtype=np.int64)
-        self.next_push = np.zeros(m, dtype=np.int64)
-        self.crossing = np.zeros(m, dtype=bool)
-        self.speed = np.zeros(m)
-        self.leaping = np.zeros(m, dtype=bool)
-        self.follow = np.zeros(m)
-        self.pitch = np.zeros(m)
-        self.facing = np.zeros(m)
-        self.waypoint = np.zeros((m, 2))
+        self.elapsed = np.zeros(m, dtype=np.int64)  # control steps
+        self.began = np.zeros(m, dtype=np.int64)  # ``elapsed`` at the first step
+        self.next_push = np.zeros(m, dtype=np.int64)  # ``elapsed`` at the next push
+        self.was_contact = np.zeros((m, 4), dtype=bool)  # of the feet, at the last step
+        self.origin = np.zeros((m, 2))  # m in the world, corner of the tile
+        self.crossing = np.zeros(m, dtype=bool)  # the others have free commands
+        # Of a crossing:
+        self.waypoint = np.zeros((m, 2))  # m in the world
         self.reached = np.zeros(m, dtype=bool)
-        self.was_contact = np.zeros((m, 4), dtype=bool)
-        self.origin = np.zeros((m, 2))
+        self.speed = np.zeros(m)  # m/s
+        self.facing = np.zeros(m)  # rad, heading against the bearing of the waypoint
+        self.pitch = np.zeros(m)  # rad, nose down
+        self.follow = np.zeros(m)  # share of the slope under the robot that pitch follows besides
+        self.leaping = np.zeros(m, dtype=bool)  # over trenches
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All of them by name, in place."""

@@ -298,7 +298,6 @@ class NavigationTask:
         self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
-        self.actor_dim = width(high_layout(config.cues))
         self.observation_space, self.action_space = high_spaces(config, bool(guided))
 
     def _build_robots(self) -> None:
@@ -404,7 +403,7 @@ class NavigationTask:
         return reward, failed, truncated
 
     def observe(self) -> NDArray[np.float32]:
-        """o^H, (M, actor_dim), and with a teacher its actions, (M, 13)."""
+        """o^H, (M, n), and with a teacher its actions, (M, 13)."""
         seen = observe_high(
             self.locomotion,
             self.goal,

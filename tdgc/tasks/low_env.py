@@ -1,4 +1,4 @@
-"""The execution-level MDP (paper Sec. IV-A): follow commands, in gait, on rising terrain.
+"""The low policy's MDP (paper Sec. IV-A): follow commands, in gait, on rising terrain.
 
 ``LowLevelTask`` is the MDP for M robots at once; ``LowLevelEnv`` is its Gymnasium face for one.
 """
@@ -17,7 +17,7 @@ from tdgc.parallel.worker import Task
 from tdgc.sim.commands import gait_index
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.observation import observe, width
+from tdgc.sim.observation import observe
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, draw_start_goal
@@ -39,12 +39,12 @@ _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap
 
 
 class LowLevelTask:
-    """The low-level MDP of M robots.
+    """The low policy's MDP, M robots at once.
 
-    Observation rows are [actor part | critic part]; ``actor_dim`` says where the actor's ends.
-    Actions are (M, 12) in [-a_max, a_max]. An episode ends in failure when the trunk is lower than
-    0.15 m above the support surface or hits something with more than 40 N, and is truncated after
-    20 s, where the robot leaves its tile, or when it has crossed it.
+    Observation rows are [actor part | critic part], see ``tdgc.tasks.low_observation``. Actions are
+    (M, 12) in [-a_max, a_max]. An episode ends in failure when the trunk is lower than 0.15 m above
+    the support surface or hits something with more than 40 N, and is truncated after 20 s, where
+    the robot leaves its tile, or when it has crossed it.
 
     Args:
         config: the MDP's configuration.
@@ -91,7 +91,6 @@ class LowLevelTask:
         self._noise = Noise(config.randomisation, self.rng) if training else None
         self._build()
         self.stats = Sums()
-        self.actor_dim = width(self.locomotion.layout)
         self.observation_space, self.action_space = low_spaces(config)
 
     def _build(self) -> None:
@@ -142,8 +141,8 @@ class LowLevelTask:
     def _draw_commands(self, index: NDArray[np.integer]) -> None:
         """New commands for the robots ``index`` (n,), free or to cross their tiles with."""
         bounds = self.commands.bounds(len(index))
-        self.crossings.narrow(index, self.level, bounds)
-        gait, values = self.commands.draw(bounds, ~self.episodes.crossing[index])
+        self.crossings.narrow(index, self.level, *bounds)
+        gait, values = self.commands.draw(*bounds, ~self.episodes.crossing[index])
         self.crossings.draw(index, gait, values)
         command = np.concatenate([values, gait_embedding(gait)], axis=1)
         self.locomotion.command[index] = command
