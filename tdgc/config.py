@@ -380,7 +380,9 @@ class LowTrainConfig:
     checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
     env: LowLevelConfig = field(default_factory=LowLevelConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    calibration: CalibrationConfig = field(
+        default_factory=CalibrationConfig, metadata={"before": {"robots": 0, "turns": 60}}
+    )
 
 
 @dataclass(frozen=True)
