@@ -34,7 +34,16 @@ from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_mirror, load_low, paired, summarise
+from tdgc.sim.world import check_robot
+from tdgc.tasks.high_env import (
+    PRETRAINED,
+    NavigationTask,
+    high_mirror,
+    high_spaces,
+    load_low,
+    paired,
+    summarise,
+)
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.teacher import STYLES
 from tdgc.tasks.tiles import check_families
@@ -79,12 +88,9 @@ def make_env(
     env_config = config.env
     if config.imitation.steps:  # what was imitated on all levels goes on on all
         env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
-    probe = NavigationTask(env_config, low, 1, seed=0, guided=guided)
-    spaces = probe.observation_space, probe.action_space
-    probe.close()
     landing = None
     if guided and "gap" in env_config.families:
-        landing = measure_landing(low, probe.low_config)
+        landing = measure_landing(*load_low(low))
         if landing is None:
             tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
     return TaskVecEnv(
@@ -92,7 +98,7 @@ def make_env(
         config.n_envs,
         config.workers,
         config.seed,
-        spaces,
+        high_spaces(env_config, bool(guided)),
         recover=True,
         timeout=timeout,
         link=link,
@@ -187,6 +193,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = dataclasses.replace(config, low=config.low or find_low())
         low, low_config = load_low(cast(str, config.low))
         tqdm.write(f"low policy: {config.low}")
+        check_robot(low_config.robot, low_config.physics)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check_families(config.env.families)
         unknown = config.env.unknown_share

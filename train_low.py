@@ -26,10 +26,15 @@ from tdgc.learn.ppo import NoiseScaledRate, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
-from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
+from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.show import plots
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import width
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.low_env import LowLevelTask, make_task, summarise
+from tdgc.sim.world import check_robot
+from tdgc.tasks.low_env import make_task
+from tdgc.tasks.low_observation import low_mirror, low_spaces
+from tdgc.tasks.low_statistics import summarise
 from tdgc.tasks.tiles import check_families
 
 
@@ -94,20 +99,17 @@ def build(
     link: MakeLink,
 ) -> tuple[PPO, TaskVecEnv]:
     """Workers and learner of one phase."""
-    probe = LowLevelTask(env_config[0], 1, seed=0)
     env = TaskVecEnv(
         functools.partial(make_task, env_config, config.plane_share),
         config.n_envs,
         config.workers,
         config.seed,
-        (probe.observation_space, probe.action_space),
+        low_spaces(config.env),
         recover=True,
         timeout=timeout,
         link=link,
     )
     ppo = config.ppo
-    (obs_index, obs_sign), (act_index, act_sign) = probe.observation_mirror, probe.action_mirror
-    mirror = Mirror(*(tuple(x.tolist()) for x in (obs_index, obs_sign, act_index, act_sign)))
     rate = NoiseScaledRate(ppo.learning_rate, ppo.final_learning_rate, ppo.initial_std)
     model = PPO(
         AsymmetricActorCriticPolicy,
@@ -116,8 +118,8 @@ def build(
         batch_size=ppo.batch_size,
         **shared_keywords(ppo),
         policy_kwargs={
-            "actor_dim": probe.actor_dim,
-            "mirror": mirror if ppo.mirror else None,
+            "actor_dim": width(actor_layout(config.env.gyro)),
+            "mirror": low_mirror(config.env) if ppo.mirror else None,
             "net_arch": {"pi": list(ppo.actor), "vf": list(ppo.critic)},
             "optimizer_kwargs": {"eps": ppo.adam_eps},
             "activation_fn": policies.ACTIVATIONS[ppo.activation],
@@ -127,7 +129,6 @@ def build(
         device=device,
     )
     rate.log_std = model.policy.log_std
-    probe.close()
     return model, env
 
 
@@ -138,6 +139,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = configure(LowTrainConfig(), args)
         check_families(config.env.families)
+        check_robot(config.env.robot, config.env.physics)
         meta = {
             "config": to_dict(config.env),
             "seed": config.seed,

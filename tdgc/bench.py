@@ -17,7 +17,6 @@ turn; the table is in ``cluster.json``.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import functools
 import json
 import os
@@ -40,12 +39,15 @@ from tdgc.errors import InputError
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
-from tdgc.parallel.vec import TaskVecEnv
+from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
-from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
+from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS
-from tdgc.tasks.high_env import PRETRAINED, NavigationTask
+from tdgc.tasks.high_env import high_spaces
 from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import low_mirror, low_spaces
 
 _COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
 UPDATES = 80  # turns of ``--update``: other work shares the cores
@@ -58,13 +60,9 @@ _TURNS = 10  # of each place in a comparison
 
 def spread_levels(env: TaskVecEnv, levels: int) -> None:
     """New episodes for all robots, spread over the levels as a training's are."""
-    kept = ("rng", "tiles_drawn", "landing", "command_share", "restarts")
     env.load_state_dicts(
         [
-            {
-                **{key: state[key] for key in kept},
-                "level": np.arange(len(state["level"])) % levels,
-            }
+            {**without_episodes(state), "level": np.arange(len(state["level"])) % levels}
             for state in env.state_dicts()
         ]
     )
@@ -73,11 +71,8 @@ def spread_levels(env: TaskVecEnv, levels: int) -> None:
 def make_env(
     config: LowLevelConfig, robots: int, workers: int, link: MakeLink = ProcessLink
 ) -> TaskVecEnv:
-    probe = LowLevelTask(dataclasses.replace(config, terrain="plane"), 1, seed=0)
-    spaces = probe.observation_space, probe.action_space
-    probe.close()
     task = functools.partial(LowLevelTask, config)
-    return TaskVecEnv(task, robots, workers, 0, spaces, link=link)
+    return TaskVecEnv(task, robots, workers, 0, low_spaces(config), link=link)
 
 
 def settle(env: TaskVecEnv, levels: int) -> NDArray[np.float32]:
@@ -127,20 +122,18 @@ def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
 
     Each is taken ``n_epochs`` times, in minibatches, forwards and backwards through both networks.
     """
-    probe, ppo = LowLevelTask(config.env, 1, seed=0), config.ppo
-    maps = (*probe.observation_mirror, *probe.action_mirror)
+    ppo, (observed, acted) = config.ppo, low_spaces(config.env)
     policy = AsymmetricActorCriticPolicy(
-        probe.observation_space,
-        probe.action_space,
+        observed,
+        acted,
         lambda _: ppo.learning_rate,
-        actor_dim=probe.actor_dim,
-        mirror=Mirror(*(tuple(part.tolist()) for part in maps)) if ppo.mirror else None,
+        actor_dim=width(actor_layout(config.env.gyro)),
+        mirror=low_mirror(config.env) if ppo.mirror else None,
         net_arch={"pi": list(ppo.actor), "vf": list(ppo.critic)},
         activation_fn=ACTIVATIONS[ppo.activation],
     )
-    probe.close()
-    seen = th.randn(ppo.batch_size, probe.obs_dim)
-    actions = th.randn(ppo.batch_size, probe.action_space.shape[0])
+    seen = th.randn(ppo.batch_size, *observed.shape)
+    actions = th.randn(ppo.batch_size, *acted.shape)
 
     def update() -> None:
         values, log_prob, _ = policy.evaluate_actions(seen, actions)
@@ -277,10 +270,7 @@ def compare_loads(seconds: float) -> dict[str, Any]:
 def compare_updates(updates: int) -> dict[str, float]:
     """update.json: ``update_seconds`` on the default configuration."""
     config = HighTrainConfig()
-    probe = NavigationTask(config.env, PRETRAINED / "low", 1, seed=0)
-    spaces = probe.observation_space, probe.action_space
-    probe.close()
-    result = update_seconds(config, spaces, updates)
+    result = update_seconds(config, high_spaces(config.env), updates)
     head("update", "seconds", "ratio")
     for name, ratio in (("stock", 1.0), ("fast", result["ratio"])):
         print(f"{name:<8}{result[name]:>11.3f}{ratio:>11.1f}")

@@ -33,9 +33,17 @@ from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import Task, WorkerError
 from tdgc.policies import Actor, Policy
-from tdgc.sim.commands import CONTINUOUS, NUM_COMMANDS, commands_of, observed_command
+from tdgc.sim.commands import (
+    CONTINUOUS,
+    NAMES,
+    NUM_COMMANDS,
+    SIDEWAYS,
+    commands_of,
+    observed_command,
+)
 from tdgc.sim.gaits import GAITS
-from tdgc.sim.locomotion import ACTOR_LAYOUT, MIRRORS
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array
 from tdgc.tasks.high_env import load_low
 from tdgc.tasks.low_env import LowLevelTask, make_task
@@ -64,11 +72,8 @@ _UPDATES, _STATES = 120, 1024  # minibatches a turn, and their size
 _RATE = 3e-4  # of Adam, falling to nothing
 _WALKING, _FITTED = 0.3, 0.4  # about the shares of the time that are over after walking and fitting
 
-_SIGN = np.array(MIRRORS["command"][1])
-_NAMES = [name for name, _ in ACTOR_LAYOUT]
-# Column of the first command in an observation.
-_FIRST = sum(width for _, width in ACTOR_LAYOUT[: _NAMES.index("command")])
-_COMMAND = slice(_FIRST, _FIRST + NUM_COMMANDS)
+_SIGN = np.where(np.isin(NAMES, SIDEWAYS), -1.0, 1.0)  # of commands in a left-right mirror
+_COMMAND = columns(actor_layout(gyro=False))["command"]  # in an observation
 
 
 # ------------------------------------------------------------------ what a command leads to

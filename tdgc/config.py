@@ -23,6 +23,9 @@ from typing import Any, Literal, TypeVar
 from tdgc.errors import InputError
 
 Range = typing.Annotated[tuple[float, float], "low <= high"]
+Share = typing.Annotated[float, "0 to 1"]
+#: Of trot, pronk, pace and bound.
+GaitShares = typing.Annotated[tuple[Share, Share, Share, Share], "1 together"]
 
 
 class ConfigError(InputError):
@@ -193,11 +196,63 @@ class RandomisationConfig:
 
 
 @dataclass(frozen=True)
+class CommandDrawConfig:
+    """Commands drawn in training, uniform within their ranges, and the curriculum that widens the
+    velocity ranges of each gait."""
+
+    # Of free commands, which lead anywhere. Trot is what crossings are mostly made in.
+    gaits: GaitShares = (0.2, 0.2, 0.3, 0.3)
+    standing: Share = 0.1  # with no velocity: stepping on the spot is asked for at every goal
+    # Free commands that leap: pronk with a stride as long as the trunk, whose front and rear feet
+    # land on the same lines, so that a trench fits between two of them. Drawn evenly, such commands
+    # are too rare: of 0.86 m/s at 2 Hz the robot did 0.5.
+    leaps: Share = 0.05
+    leap_vx: Range = (0.85, 1.0)  # shares of the range: 0.7-1 m/s
+    leap_frequency: Range = (0.0, 0.375)  # shares of the range: 2-2.75 Hz
+    growth: float = 0.05  # of the whole ranges, when a gait was tracked well
+    growth_steps: int = 200  # control steps of all robots, 4 s, after which a gait is judged
+    # Shares of what perfect tracking earns: errors of about 0.26 m/s and 0.32 rad/s at the default
+    # sigmas.
+    growth_velocity: Share = 0.5
+    growth_yaw_rate: Share = 0.5
+    # Share of feet in contact as desired: speed comes after gait. At 0.8 bound never left its first
+    # ranges, since its rear feet lift late, and then undershot every faster command.
+    growth_contact: Share = 0.7
+
+
+@dataclass(frozen=True)
+class CrossingConfig:
+    """Training episodes that cross a tile from platform to platform, as the high policy will ask
+    for, and the levels that rise with them."""
+
+    share: Share = 0.8  # of the episodes on tiles that are not flat; the others have free commands
+    # Trot climbs best, and with all gaits alike the worst one decides how far levels rise.
+    gaits: GaitShares = (0.8, 0.05, 0.075, 0.075)
+    # Over trenches most leap, their landings planned (``tdgc.tasks.leaps``). Other gaits fall into
+    # the first trench, and with half of the crossings in them levels stayed below 2.
+    trench_gaits: GaitShares = (0.15, 0.85, 0.0, 0.0)
+    speed: Range = (0.25, 0.8)  # m/s
+    leap_speed: Range = (0.9, 1.0)  # m/s, up to ``tdgc.tasks.leaps.SPEED``
+    facing: Share = 0.8  # face where they go, the others any way
+    heading_gain: float = 1.0  # 1/s, yaw rate asked for per rad of heading error
+    # What a crossing leaves of the command ranges: m added to the least swing height, at difficulty
+    # 0 and 1. With feet below 9 cm a third crossed level 0 of Gap where all did above 16 cm.
+    clearance: tuple[float, float] = (0.05, 0.15)
+    bend: Share = 0.3  # of the pitch and roll ranges at difficulty 1
+    leap_decimation: int = 5  # control steps between two decisions on a leap: as the high policy's
+    landing_rate: float = 0.002  # of a landing in what is known of them: the last 500 count
+    shallowest_trench: float = 0.05  # m deep on level 0, see ``tdgc.tasks.tiles.shallow``
+    demotion: Share = 0.5  # of the tile; who gets less far goes down a level (legged_gym)
+
+
+@dataclass(frozen=True)
 class LowLevelConfig:
     """The execution-level MDP (Sec. IV-A)."""
 
     terrain: Literal["plane", "tiles"] = "plane"
     levels: int = 11  # of the curriculum: 0..levels-1
+    # Robots begin spread over levels 0..first_levels-1.
+    first_levels: int = field(default=3, metadata={"before": 3})
     # Pillar is left out: a policy that sees no obstacle can learn nothing of it but bumps. Stairs
     # and trenches, twice as many, are what it is still learning when slopes are easy.
     families: tuple[str, ...] = ("stair", "stair", "gap", "gap", "tilt", "rough")
@@ -208,6 +263,15 @@ class LowLevelConfig:
     robot: RobotConfig = field(default_factory=RobotConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     commands: CommandRanges = field(default_factory=CommandRanges)
+    # These two stood in the code before they were configuration. Where a default of theirs changes,
+    # what it was must be written here.
+    command_draw: CommandDrawConfig = field(
+        default_factory=CommandDrawConfig,
+        metadata={"before": dataclasses.asdict(CommandDrawConfig())},
+    )
+    crossing: CrossingConfig = field(
+        default_factory=CrossingConfig, metadata={"before": dataclasses.asdict(CrossingConfig())}
+    )
     rewards: LowRewardConfig = field(default_factory=LowRewardConfig)
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
@@ -316,7 +380,9 @@ class LowTrainConfig:
     checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
     env: LowLevelConfig = field(default_factory=LowLevelConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    calibration: CalibrationConfig = field(
+        default_factory=CalibrationConfig, metadata={"before": {"robots": 0, "turns": 60}}
+    )
 
 
 @dataclass(frozen=True)
@@ -539,11 +605,15 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
     """``value`` as the annotated type: the few that configurations use, and nothing else."""
     origin = typing.get_origin(hint)
     shown = reprlib.repr(value)  # short, whatever the file holds
-    if hint == Range:
-        low, high = _coerce(typing.get_args(hint)[0], value, path)
-        if low > high:
+    if origin is typing.Annotated:
+        checked = _coerce(typing.get_args(hint)[0], value, path)
+        if hint == Range and checked[0] > checked[1]:
             raise ConfigError(f"'{path}' must be [low, high] with low <= high, not {shown}")
-        return low, high
+        if hint == Share and not 0.0 <= checked <= 1.0:
+            raise ConfigError(f"'{path}' must be from 0 to 1, not {shown}")
+        if hint == GaitShares and not math.isclose(sum(checked), 1.0):
+            raise ConfigError(f"'{path}' must add up to 1, not {shown}")
+        return checked
     if origin is Literal:
         if value not in typing.get_args(hint):
             allowed = ", ".join(typing.get_args(hint))

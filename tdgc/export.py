@@ -23,7 +23,7 @@ import logging
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,8 @@ from tdgc.sim.commands import (
 )
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
 from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry
-from tdgc.sim.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import Term, width
 from tdgc.sim.robot import (
     HIGHEST_FOOT,
     NUM_JOINTS,
@@ -93,7 +94,17 @@ def _constant(value: ArrayLike) -> Tensor:
 
 
 _TURN = _constant(2.0 * np.pi)
-_SPEED_UNIT = _constant(SPEED_SCALE)
+
+
+class Row:
+    """Rows of a network's inputs, in the order and scales of ``layout``."""
+
+    def __init__(self, layout: Sequence[Term[Any]]) -> None:
+        self._terms = [(term.name, _constant(term.scale)) for term in layout]
+
+    def __call__(self, terms: Mapping[str, Tensor]) -> Tensor:
+        """Terms by name, in the units that they are read in -> (n,) float32."""
+        return th.cat([scale * terms[name] for name, scale in self._terms]).float()
 
 
 @dataclass(frozen=True)
@@ -209,6 +220,7 @@ class LowLevel(nn.Module):
         self.dt = _constant(config.physics.control_dt)
         self.limit = _constant(robot.action_limit)
         self.pose = Pose(robot)
+        self.row = Row(actor_layout(config.gyro))
         self.whole = _constant(1.0)
         ramped = robot.commanded_pose and robot.swing_ramp > 0.0
         self.ramp = _constant(robot.swing_ramp) if ramped else None
@@ -265,19 +277,14 @@ class LowLevel(nn.Module):
             missing = (self.least - command[INDEX["frequency"]]).clamp(min=0.0)
             command = command + self.is_frequency * (early * missing)
         pose = self.pose(clock, grown, command)
-        parts = [
-            x["gravity"],
-            x["joint_angles"] - pose,
-            _SPEED_UNIT * x["joint_speeds"],
-            x["last_action"],
-            x["action_before"],
-            self.command_gain * command + self.command_zero,
-            clock_signal(clock, command),
-            self._gait(command),
-        ]
-        if "gyro" in x:
-            parts.append(GYRO_SCALE * x["gyro"])
-        action = self.actor(th.cat(parts).float()).double().clamp(-self.limit, self.limit)
+        terms = x | {
+            "joint_error": x["joint_angles"] - pose,
+            "joint_speed": x["joint_speeds"],
+            "command": self.command_gain * command + self.command_zero,
+            "clock": clock_signal(clock, command),
+            "gait": self._gait(command),
+        }
+        action = self.actor(self.row(terms)).double().clamp(-self.limit, self.limit)
         run = self.dt * command[INDEX["frequency"]]
         clock = clock + run
         targets = (pose + self.joint_scale * action).clamp(self.lowest, self.highest)
@@ -302,6 +309,8 @@ class HighLevel(nn.Module):
         super().__init__()
         self.actor = ClippedActor(policy)
         self.lstm = policy._lstm
+        layout = high_layout(config.cues)
+        self.row = Row(layout)
         hidden = self.lstm[1].shape[1]
         decoder = CommandDecoder(config.commands, config.action_limit)
         self.low = _constant(decoder.low[:12])
@@ -330,7 +339,7 @@ class HighLevel(nn.Module):
             Signal("last_decision", NUM_ACTIONS, "1", "the last", "decision", "decision", 0.0),
             Signal("last_commands", NUM_COMMANDS, None, "the last", "commands", "commands", start),
             Signal("clock", 1, "1", "the low level's in its coming step"),
-            *(cues[name] for name, _ in high_layout(config.cues) if name in cues),
+            *(cues[term.name] for term in layout if term.name in cues),
             Signal("hidden", hidden, "1", "state of the LSTM", None, "next_hidden", 0.0),
             Signal("cell", hidden, "1", "cell of the LSTM", None, "next_cell", 0.0),
         ]
@@ -346,22 +355,19 @@ class HighLevel(nn.Module):
         x = _by_name(self.inputs, values)
         goal = x["goal"]
         distance = (goal * goal).sum(0, keepdim=True).sqrt()
-        parts = [
-            GOAL_SCALE * distance,
-            th.where(distance > 0.0, goal / distance, self.ahead),
-            x["time_left"] / self.seconds,
-            x["gravity"],
-            x["joint_angles"] - self.nominal,
-            _SPEED_UNIT * x["joint_speeds"],
-            self._normalise(x["last_decision"]),
-            clock_signal(x["clock"], x["last_commands"]),
-        ]
-        if "family" in x:
-            parts.append(x["family"])
+        direction = th.where(distance > 0.0, goal / distance, self.ahead)
+        terms = x | {
+            "goal": th.cat([GOAL_SCALE * distance, direction]),
+            "time_left": x["time_left"] / self.seconds,
+            "joint_error": x["joint_angles"] - self.nominal,
+            "joint_speed": x["joint_speeds"],
+            "last_action": self._normalise(x["last_decision"]),
+            "clock": clock_signal(x["clock"], x["last_commands"]),
+        }
         if "probes" in x:
-            parts.append(x["probes"].clamp(-PROBE_RANGE, PROBE_RANGE) / PROBE_RANGE)
+            terms["probes"] = x["probes"].clamp(-PROBE_RANGE, PROBE_RANGE)
         state = (x["hidden"].float()[None], x["cell"].float()[None])
-        hidden, cell = th.lstm_cell(th.cat(parts).float()[None], state, *self.lstm)
+        hidden, cell = th.lstm_cell(self.row(terms)[None], state, *self.lstm)
         decision = self.actor(hidden[0]).double()
         return decision, self._decode(decision), hidden[0].double(), cell[0].double()
 
@@ -400,10 +406,10 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
         ValueError: a file that cannot be used, or levels that do not fit each other.
     """
     low_policy, low_config = load_low(low)
-    width = sum(size for _, size in ACTOR_LAYOUT + (GYRO_LAYOUT if low_config.gyro else ()))
-    if low_policy.actor_dim != width:
+    size = width(actor_layout(low_config.gyro))
+    if low_policy.actor_dim != size:
         raise ConfigError(
-            f"{low}: its configuration gives {width} observations, it takes {low_policy.actor_dim}"
+            f"{low}: its configuration gives {size} observations, it takes {low_policy.actor_dim}"
         )
     return Pair(low_policy, low_config, *load_high(high, low_policy, low_config))
 

@@ -17,15 +17,13 @@ from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
 from tdgc.learn.recurrent import FastRecurrentPPO
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import low_spaces
 
 
 def test_robots_are_spread_over_the_levels() -> None:
     """Five robots in two workers, of which each spreads its own; all begin new episodes."""
     config = LowLevelConfig()
-    probe = LowLevelTask(config, 1, 0)
-    spaces = probe.observation_space, probe.action_space
-    probe.close()
-    env = TaskVecEnv(functools.partial(LowLevelTask, config), 5, 2, 0, spaces)
+    env = TaskVecEnv(functools.partial(LowLevelTask, config), 5, 2, 0, low_spaces(config))
     env.reset()
     env.step(np.zeros((5, 12), dtype=np.float32))
     bench.spread_levels(env, 2)

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 
 from tdgc import calibration, policies
 from tdgc.calibration import Corrector, ResponseModel, distil, measure, training_tasks
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
 from tdgc.parallel.vec import TaskVecEnv
-from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
+from tdgc.policies import AsymmetricActorCriticPolicy, Policy
 from tdgc.sim.commands import INDEX, commands_of, observed_command
 from tdgc.sim.gaits import GAITS, gait_embedding
-from tdgc.sim.locomotion import ACTOR_LAYOUT, MIRRORS, action_mirror, mirror_map
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import width
 from tdgc.sim.robot import Array
-from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import low_mirror, low_spaces
 
 RANGES = CommandRanges()
 HALF = np.array([1.0, 0.6, 1.0])  # of the velocity ranges
@@ -38,18 +38,10 @@ def commands(n: int, width: float = 1.0) -> Array:
 
 def save_low(path: Path) -> Policy:
     """A small symmetric policy whose actions depend on everything it sees."""
-    parts = (*mirror_map(ACTOR_LAYOUT, MIRRORS), *action_mirror())
-    size, limit = sum(n for _, n in ACTOR_LAYOUT), CONFIG.robot.action_limit
-    probe = LowLevelTask(CONFIG, 1, seed=0)
-    width = probe.obs_dim
-    full = (*probe.observation_mirror, *action_mirror())
-    probe.close()
-    assert all((a == b[: len(a)]).all() for a, b in zip(parts, full, strict=True))
     th.manual_seed(0)
     policy = AsymmetricActorCriticPolicy(
-        spaces.Box(-np.inf, np.inf, (width,), np.float32),
-        spaces.Box(-limit, limit, (12,), np.float32), lambda _: 1e-3, actor_dim=size,
-        mirror=Mirror(*(tuple(part.tolist()) for part in full)), net_arch=[32],
+        *low_spaces(CONFIG), lambda _: 1e-3, actor_dim=width(actor_layout(CONFIG.gyro)),
+        mirror=low_mirror(CONFIG), net_arch=[32],
     )  # fmt: skip
     with th.no_grad():
         for parameter in policy.parameters():
@@ -153,7 +145,7 @@ def test_robots_learn_on_a_plane_and_on_all_levels() -> None:
     assert [task.num_robots for task in tasks.tasks] == [18, 12]
     assert tasks.tasks[0].tiles is None
     assert tasks.tasks[1].level.tolist() == [*range(11), 0]
-    assert all((task.command_share == 1.0).all() for task in tasks.tasks)
+    assert all((task.commands.share == 1.0).all() for task in tasks.tasks)
     tasks.close()
 
 
@@ -161,11 +153,8 @@ def test_a_student_learns_what_is_done_at_corrected_commands(
     low: Policy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calibration, "_TURN", 8)
-    probe = LowLevelTask(CONFIG, 1, seed=0)
-    spaces_of = probe.observation_space, probe.action_space
-    probe.close()
     tasks = functools.partial(training_tasks, CONFIG)
-    env = TaskVecEnv(tasks, 10, 1, 0, spaces_of)
+    env = TaskVecEnv(tasks, 10, 1, 0, low_spaces(CONFIG))
 
     def correct(command: Array) -> Array:
         return np.concatenate([1.2 * command[:, :3], command[:, 3:]], axis=1)

@@ -60,6 +60,27 @@ def test_what_was_recorded_must_be_whole() -> None:
         recorded(LowTrainConfig, data, "run")
 
 
+def test_a_run_from_before_the_task_was_configured() -> None:
+    """Its numbers stood in the code; these are what they were, whatever the defaults are now."""
+    data = to_dict(LowLevelConfig())
+    for key in ("first_levels", "command_draw", "crossing"):
+        del data[key]
+    then = to_dict(recorded(LowLevelConfig, data, "run"))
+    assert then["first_levels"] == 3
+    assert then["command_draw"] == {
+        "gaits": [0.2, 0.2, 0.3, 0.3], "standing": 0.1,
+        "leaps": 0.05, "leap_vx": [0.85, 1.0], "leap_frequency": [0.0, 0.375],
+        "growth": 0.05, "growth_steps": 200, "growth_velocity": 0.5, "growth_yaw_rate": 0.5,
+        "growth_contact": 0.7,
+    }  # fmt: skip
+    assert then["crossing"] == {
+        "share": 0.8, "gaits": [0.8, 0.05, 0.075, 0.075], "trench_gaits": [0.15, 0.85, 0.0, 0.0],
+        "speed": [0.25, 0.8], "leap_speed": [0.9, 1.0], "facing": 0.8, "heading_gain": 1.0,
+        "clearance": [0.05, 0.15], "bend": 0.3, "leap_decimation": 5, "landing_rate": 0.002,
+        "shallowest_trench": 0.05, "demotion": 0.5,
+    }  # fmt: skip
+
+
 def test_a_whole_number_is_a_float_but_not_the_other_way_round() -> None:
     config = from_dict(RobotConfig, {"kp": 25})
     assert config.kp == 25.0 and isinstance(config.kp, float)
@@ -101,6 +122,12 @@ def test_configurations_cannot_be_changed_in_place() -> None:
         ({"env": {"commands": {"vx": [1, -1]}}}, r"must be \[low, high\] with low <= high"),
         ({"env": {"commands": {"vx": [0, "1"]}}}, "'env.commands.vx' must be of type float, not"),
         ({"env": {"commands": {"vx": [0, 1, 2]}}}, "'env.commands.vx' must have 2 values, not 3"),
+        (
+            {"env": {"crossing": {"share": 1.5}}},
+            "crossing.share' must be from 0 to 1, not 1.5",
+        ),
+        ({"env": {"crossing": {"gaits": [1, 1, 0, 0]}}}, "crossing.gaits' must add up to 1, not"),
+        ({"env": {"crossing": {"gaits": [2, -1, 0, 0]}}}, "gaits' must be from 0 to 1, not 2"),
         ({"env": {"commands": {"vx": [0, float("inf")]}}}, "vx' must be a finite number, not inf"),
     ],
 )

@@ -33,6 +33,7 @@ from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command, gait_index
 from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.observation import width
 from tdgc.sim.robot import Array
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import (
@@ -60,7 +61,7 @@ def save_high(
     meta: dict[str, Any] | None = None,
 ) -> Path:
     """A small high level with random weights that walks about: gaits and commands vary."""
-    size = size or sum(width for _, width in high_layout(config.cues))
+    size = size or width(high_layout(config.cues))
     policy = FastRecurrentPolicy(
         spaces.Box(-np.inf, np.inf, (size,)),
         spaces.Box(-config.action_limit, config.action_limit, (NUM_ACTIONS,)),

@@ -18,19 +18,14 @@ from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
 from tdgc.export import FORMATS, TOLERANCE, Graph, HighLevel, LowLevel
 from tdgc.learn.recurrent import FastRecurrentPolicy
-from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
+from tdgc.policies import AsymmetricActorCriticPolicy, Policy
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
-from tdgc.sim.locomotion import (
-    ACTOR_LAYOUT,
-    GYRO_LAYOUT,
-    MIRRORS,
-    Locomotion,
-    action_mirror,
-    mirror_map,
-)
+from tdgc.sim.locomotion import Locomotion, actor_layout
+from tdgc.sim.observation import width
 from tdgc.sim.robot import JOINTS, nominal_pose
 from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_layout, load_low, observe_high
+from tdgc.tasks.low_observation import low_mirror
 from tdgc.tasks.probes import PROBES, height_probes
 
 LOW = PRETRAINED / "low"
@@ -55,7 +50,7 @@ def random_high(
     path: Path, config: HighLevelConfig, low: LowLevelConfig = LOW_CONFIG, hidden: int = 32
 ) -> Path:
     """A high level with random weights, saved as ``train_high.py`` saves one."""
-    size = sum(n for _, n in high_layout(config.cues))
+    size = width(high_layout(config.cues))
     limit = config.action_limit
     policy = FastRecurrentPolicy(
         unbounded(size), spaces.Box(-limit, limit, (13,)), lambda _: 1e-3,
@@ -68,13 +63,8 @@ def random_high(
 
 
 def random_low(path: Path, config: LowLevelConfig, symmetric: bool) -> Policy:
-    layout = ACTOR_LAYOUT + (GYRO_LAYOUT if config.gyro else ())
-    size = sum(n for _, n in layout)
-    limit = config.robot.action_limit
-    mirror = None
-    if symmetric:
-        parts = (*mirror_map(layout, MIRRORS), *action_mirror())
-        mirror = Mirror(*(tuple(part.tolist()) for part in parts))
+    size, limit = width(actor_layout(config.gyro)), config.robot.action_limit
+    mirror = low_mirror(config).actor_part(size) if symmetric else None
     policy = AsymmetricActorCriticPolicy(
         unbounded(size), spaces.Box(-limit, limit, (12,)), lambda _: 1e-3,
         actor_dim=size, mirror=mirror, net_arch=[32],

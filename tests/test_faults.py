@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.parallel.vec import FAULT_STEPS, Fault, TaskVecEnv, worker_seed
 from tdgc.parallel.worker import WorkerError
+from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array
 from tdgc.state import State, join, split
 from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import CRITIC_LAYOUT
 
 # What a robot's action makes of its task.
 RAISE, DIE, HANG, NAN_SEEN, NAN_EARNED, INFINITE, FAR = range(2, 9)
@@ -34,7 +36,6 @@ class Fragile:
     at each restart. A robot earns its action.
     """
 
-    actor_dim = 4
     observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
     action_space = gym.spaces.Box(-9.0, 9.0, (1,), np.float32)
 
@@ -295,7 +296,7 @@ class Poisoned(LowLevelTask):
 
     def restart(self) -> None:
         super().restart()
-        self.elapsed[:] = 0  # so that no episode ends here
+        self.episodes.elapsed[:] = 0  # so that no episode ends here
 
 
 def make_poisoned(robots: int, seed: int) -> Poisoned:
@@ -321,8 +322,8 @@ def test_a_blow_up_inside_bullet() -> None:
     assert ends == [0] * 7 + [3] + [0] * 24
     sums = env.stats()[0]
     assert sums["blow_ups"] == 1.0 and np.isfinite(list(sums.values())).all()
-    height = probe.actor_dim + 6  # of the trunk against the standing height, times 10
-    assert (np.abs(obs[:, height]) < 0.5).all()
+    layout = (*probe.locomotion.layout, *CRITIC_LAYOUT)
+    assert (np.abs(obs[:, columns(layout)["base_height"]]) < 0.5).all()  # 5 cm
     env.close()
     probe.close()
 

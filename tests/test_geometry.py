@@ -286,7 +286,7 @@ def test_leg_angles_of_another_robot(robot: RobotConfig) -> None:
 
 def test_payload_is_on_top_of_its_own_trunk(robot: RobotConfig) -> None:
     world = World(1, robot, PhysicsConfig())
-    world.set_dynamics([0], np.array([0.8]), np.array([2.1]))
+    world.set_dynamics([0], np.array([0.8]), np.array([2.1]), np.zeros(1))
     mass, _, inertia, *_ = world._client_of[0].getDynamicsInfo(world._bodies[0], -1)
     world.close()
     assert mass == pytest.approx(10.5)
@@ -480,6 +480,10 @@ def test_scripts_refuse_it_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixt
         assert capfd.readouterr().err == f"{name}: {path}: lacks the joints RR_hip_joint\n"
     assert results.exists()
     path.write_text(SHIPPED.replace('<box size="0.42 0.15 0.11"/>', "<box/>"), encoding="utf-8")
-    assert evaluate.main(table) == 2
-    said = f"evaluate.py: {path}: Bullet cannot load it and says why above"
-    assert capfd.readouterr().err.splitlines()[-1] == said
+    for name, main, arguments in (
+        ("train_low.py", train_low.main, train),
+        ("evaluate.py", evaluate.main, table),
+    ):
+        assert main(arguments) == 2
+        said = f"{name}: {path}: Bullet cannot load it and says why above"
+        assert capfd.readouterr().err.splitlines()[-1] == said

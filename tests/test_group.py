@@ -8,7 +8,8 @@ import pytest
 import train_low
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, PhysicsConfig
 from tdgc.parallel.group import TaskGroup
-from tdgc.tasks.low_env import LowLevelTask, make_task, summarise
+from tdgc.tasks.low_env import LowLevelTask, make_task
+from tdgc.tasks.low_statistics import summarise
 
 PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4), episode_seconds=0.4)
 TILES = dataclasses.replace(PLANE, terrain="tiles", families=("stair", "rough"))
@@ -36,7 +37,7 @@ def test_each_does_what_it_does_alone() -> None:
     """Over the ends of episodes, which last 20 steps; and their sums are added."""
     plane, tiles = make()
     group = TaskGroup(make())
-    assert group.num_robots == 5 and group.actor_dim == plane.actor_dim
+    assert group.num_robots == 5
     plane.restart()
     tiles.restart()
     group.restart()
@@ -67,7 +68,7 @@ def test_each_does_what_it_does_alone() -> None:
 
 def test_command_share_is_the_mean_over_robots() -> None:
     group = TaskGroup(make())
-    group.tasks[0].command_share[:], group.tasks[1].command_share[:] = 0.5, 1.0
+    group.tasks[0].commands.share[:], group.tasks[1].commands.share[:] = 0.5, 1.0
     assert summarise(group.take_stats())["command_share/pace"] == pytest.approx(0.8)
     group.close()
 

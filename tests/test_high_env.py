@@ -13,7 +13,8 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 import tdgc  # noqa: F401  registers the environments
 from tdgc.config import ConfigError, HighLevelConfig, HighRewardConfig, RobotConfig
 from tdgc.sim.commands import NAMES
-from tdgc.sim.locomotion import Locomotion, action_mirror
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.observation import JOINTS, columns, width
 from tdgc.sim.robot import nominal_pose
 from tdgc.sim.terrain import TILE_SIZE, make_tile
 from tdgc.tasks import rewards
@@ -34,15 +35,6 @@ LOW = PRETRAINED / "low"
 POINTS = PROBES["lines"]
 NOMINAL = nominal_pose(RobotConfig())
 CONFIG = HighLevelConfig(commands=load_low(LOW)[1].commands)
-
-
-def columns(cues: str) -> dict[str, slice]:
-    """Where each part of the observation stands."""
-    result, start = {}, 0
-    for name, size in high_layout(cues):
-        result[name] = slice(start, start + size)
-        start += size
-    return result
 
 
 @pytest.fixture
@@ -132,8 +124,7 @@ def test_weights_are_scaled_by_the_steps_duration():
 
 
 def test_layout_and_cues():
-    sizes = {cues: sum(n for _, n in high_layout(cues)) for cues in
-             ("none", "semantic", "geometric", "both")}  # fmt: skip
+    sizes = {cues: width(high_layout(cues)) for cues in ("none", "semantic", "geometric", "both")}
     assert sizes == {"none": 48, "semantic": 54, "geometric": 80, "both": 86}
     assert SEMANTIC[-1] == "unknown"
 
@@ -159,8 +150,8 @@ def test_mirrored_robots_see_mirrored_things(cues):
     xy = origin + [[x - 0.7, y + 0.1], [x - 0.7, TILE_SIZE - y - 0.1]]
     loco.place(np.arange(2), xy, np.array([0.3, -0.3]), np.full(2, 0.2))
     angles = rng.normal(0.0, 0.2, 12)
-    index, flip = action_mirror()
-    state.q[:] = [NOMINAL + angles, NOMINAL + angles[index] * flip]
+    index, flip = JOINTS
+    state.q[:] = [NOMINAL + angles, NOMINAL + angles[list(index)] * flip]
     state.derive()
     task._actions[0] = rng.uniform(-1.0, 1.0, 13)
     task._actions[0, 1] *= mirror.action_sign
@@ -199,7 +190,7 @@ def test_the_teachers_episodes_move_no_levels():
 def test_some_robots_in_training_are_not_told_their_family():
     """Of 20 robots of two families the last two of each; in an evaluation all are told."""
     config = dataclasses.replace(CONFIG, families=("tilt", "rough"), unknown_share=0.2)
-    where = columns("both")["family"]
+    where = columns(high_layout("both"))["family"]
     for training, unknown in ((True, [16, 17, 18, 19]), (False, [])):
         task = NavigationTask(config, LOW, 20, seed=0, training=training)
         task.reset(np.arange(20))
@@ -210,7 +201,7 @@ def test_some_robots_in_training_are_not_told_their_family():
 
 
 def test_goal_is_seen_in_the_heading_frame(task):
-    where = columns("both")["goal"]
+    where = columns(high_layout("both"))["goal"]
     task.goal[:] = task.locomotion.world.state.position[:, :2] + [0.0, 2.0]  # due north
     yaw = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2, 0.0])
     xy = task.locomotion.world.state.position[:, :2].copy()
@@ -233,7 +224,7 @@ def test_probes_see_what_is_ahead(task):
     xy = state.position[:, :2].copy()
     task.locomotion.place(np.arange(5), xy, np.zeros(5), np.zeros(5))
     task._probes.begin(np.arange(5))
-    probes = task.observe()[1, columns("both")["probes"]] * 0.5
+    probes = task.observe()[1, columns(high_layout("both"))["probes"]] * 0.5
     standing = state.position[1, 2] - 0.30
     assert probes[row] == pytest.approx(0.3 - standing, abs=1e-6)
     assert probes[near] == pytest.approx(-standing, abs=1e-6)
@@ -249,7 +240,7 @@ def test_sensors_are_noisy_in_training_only(training):
     try:
         task.reset(np.arange(5))
         loco = task.locomotion
-        seen = task.observe()[:, columns("both")["probes"]] * PROBE_RANGE
+        seen = task.observe()[:, columns(high_layout("both"))["probes"]] * PROBE_RANGE
         off = np.abs(seen - height_probes(loco, POINTS))
         assert (off.max() > 0.01) == training and off.max() <= 0.02 + 1e-6
         exact.load_state_dict(loco.state_dict())
@@ -262,7 +253,7 @@ def test_sensors_are_noisy_in_training_only(training):
 
 
 def test_family_is_one_hot(task):
-    family = task.observe()[:, columns("both")["family"]]
+    family = task.observe()[:, columns(high_layout("both"))["family"]]
     assert np.array_equal(family, np.eye(6)[:5])
 
 
@@ -321,8 +312,8 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
     task = NavigationTask(config, LOW, 40, seed=2, guided=8)
     try:
         task.reset(np.arange(40))
-        size = sum(width for _, width in high_layout("both"))
-        assert task.actor_dim == size and task.observation_space.shape == (size + 13,)
+        size = width(high_layout("both"))
+        assert task.observation_space.shape == (size + 13,)
         led = []
         for _ in range(8):
             led.append(task._led.mean())
@@ -354,7 +345,7 @@ def test_the_future_follows_from_the_state(episodes, guided):
         for _ in range(5):
             first.step(rng.uniform(-1, 1, (3, 13)))
         first._next_push[0] = 0
-        first._push()
+        first._pushes.push(first.locomotion.world, first.elapsed, np.ones(first.num_robots))
         first.tiles.episodes[:] = 5  # so the next ones bring new tiles
         state = first.state_dict()
         if episodes:

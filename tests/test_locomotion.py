@@ -11,18 +11,14 @@ import pytest
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.sim.commands import INDEX, observed_command
 from tdgc.sim.gaits import GAITS, gait_embedding, swing_profile
-from tdgc.sim.locomotion import (
-    ACTOR_LAYOUT,
-    GYRO_LAYOUT,
-    GYRO_SCALE,
-    SPEED_SCALE,
-    Locomotion,
-    action_mirror,
-)
+from tdgc.sim.locomotion import GYRO_SCALE, SPEED_SCALE, Locomotion, actor_layout
+from tdgc.sim.observation import JOINTS, Flip, columns, width
 from tdgc.sim.robot import Array, commanded_pose, nominal_pose
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, Tile, make_tile
-from tdgc.tasks.low_env import CRITIC_LAYOUT, LowLevelTask
+from tdgc.tasks.ground import measure_ground
+from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_mirror
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig(substeps=4)
 NOMINAL = nominal_pose(ROBOT)
@@ -32,12 +28,7 @@ NOMINAL = nominal_pose(ROBOT)
 CONVERGED = PhysicsConfig(solver_iterations=300)
 
 
-def slices(layout: tuple[tuple[str, int], ...]) -> dict[str, slice]:
-    ends = np.cumsum([size for _, size in layout])
-    return {name: slice(end - size, end) for (name, size), end in zip(layout, ends, strict=True)}
-
-
-ACTOR = slices(ACTOR_LAYOUT + GYRO_LAYOUT)
+ACTOR = columns(actor_layout(gyro=True))
 
 
 def standing(num: int = 1, gyro: bool = False, physics: PhysicsConfig = PHYSICS) -> Locomotion:
@@ -63,13 +54,15 @@ def quaternion(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def test_layout() -> None:
-    assert [f"{name} {size}" for name, size in ACTOR_LAYOUT] == [
+    assert [f"{term.name} {term.size}" for term in actor_layout(gyro=True)] == [
         "gravity 3", "joint_error 12", "joint_speed 12", "last_action 12", "action_before 12",
-        "command 15", "clock 4", "gait 1",
+        "command 15", "clock 4", "gait 1", "gyro 3",
     ]  # fmt: skip
-    assert sum(size for _, size in ACTOR_LAYOUT) == 71
+    assert actor_layout(gyro=False) == actor_layout(gyro=True)[:-1]
+    assert width(actor_layout(gyro=False)) == 71
+    assert list(ACTOR.values())[-3:] == [slice(66, 70), slice(70, 71), slice(71, 74)]
     without = standing()
-    assert without.layout == ACTOR_LAYOUT
+    assert without.layout == actor_layout(gyro=False)
     assert without.observe().shape == (1, 71)
     assert without.observe().dtype == np.float32
     without.world.close()
@@ -78,7 +71,7 @@ def test_layout() -> None:
 def test_observation_of_a_robot_that_stands(loco: Locomotion) -> None:
     seen = loco.observe()
     assert seen.shape == (2, 74)
-    assert loco.layout == ACTOR_LAYOUT + GYRO_LAYOUT
+    assert loco.layout == actor_layout(gyro=True)
     expected = np.zeros(74)
     expected[2] = -1.0
     expected[ACTOR["command"]] = observed_command(loco.executed()[0])
@@ -315,27 +308,29 @@ def test_randomise_in_part_shrinks_ranges_about_the_nominal_value() -> None:
 # ------------------------------------------------------------------ the mirror
 
 
-def mirrored(seen: Array, mirror: tuple[Array, Array]) -> Array:
-    index, sign = mirror
-    return np.asarray(sign * seen[..., index])
+def mirrored(seen: Array, flip: Flip) -> Array:
+    return np.asarray(np.array(flip.sign) * seen[..., flip.source])
+
+
+MIRROR = low_mirror(LowLevelConfig())
+ALL = Flip(MIRROR.obs_index, MIRROR.obs_sign)
 
 
 def test_mirroring_twice_is_nothing() -> None:
-    task = LowLevelTask(LowLevelConfig(gyro=True), 1, seed=0)
-    for mirror, size in ((task.observation_mirror, task.obs_dim), (task.action_mirror, 12)):
+    assert Flip(MIRROR.action_index, MIRROR.action_sign) == JOINTS
+    for flip, size in ((ALL, 114), (JOINTS, 12)):
         x = np.random.default_rng(0).normal(size=(3, size))
-        assert mirrored(x, mirror).shape == x.shape
-        assert (mirrored(mirrored(x, mirror), mirror) == x).all()
-        assert not (mirrored(x, mirror) == x).all()
-    task.close()
+        assert mirrored(x, flip).shape == x.shape
+        assert (mirrored(mirrored(x, flip), flip) == x).all()
+        assert not (mirrored(x, flip) == x).all()
 
 
 def test_action_mirror_swaps_legs_and_flips_hips() -> None:
     x = np.arange(1.0, 13.0)
-    assert mirrored(x, action_mirror()).tolist() == [
+    assert mirrored(x, JOINTS).tolist() == [
         -4.0, 5.0, 6.0, -1.0, 2.0, 3.0, -10.0, 11.0, 12.0, -7.0, 8.0, 9.0
     ]  # fmt: skip
-    np.testing.assert_allclose(mirrored(NOMINAL, action_mirror()), NOMINAL, atol=0)
+    np.testing.assert_allclose(mirrored(NOMINAL, JOINTS), NOMINAL, atol=0)
 
 
 def mirror_commands(loco: Locomotion, rng: np.random.Generator, gait: int) -> None:
@@ -363,15 +358,15 @@ def test_a_mirrored_robot_sees_a_mirrored_world(gait: int) -> None:
     xy = np.array([[0.3, 0.4], [0.3, -0.4]])
     loco.place(np.arange(2), xy, np.array([yaw, -yaw]), loco.clock.clock.copy())
     offset = rng.uniform(-0.02, 0.02, 12)
-    loco.joint_offset[:] = [offset, mirrored(offset, action_mirror())]
+    loco.joint_offset[:] = [offset, mirrored(offset, JOINTS)]
     loco.world.push([0, 1], np.array([[0.2, 0.3, 0.0], [0.2, -0.3, 0.0]]))
     rewards = []
     for _ in range(40):
         action = rng.normal(0.0, 1.0, 12)
-        reward, _, _ = task.step(np.stack([action, mirrored(action, task.action_mirror)]))
+        reward, _, _ = task.step(np.stack([action, mirrored(action, JOINTS)]))
         rewards.append(reward)
         first, second = task.observe()
-        np.testing.assert_allclose(second, mirrored(first, task.observation_mirror), atol=5e-6)
+        np.testing.assert_allclose(second, mirrored(first, ALL), atol=5e-6)
     np.testing.assert_allclose(np.array(rewards)[:, 1], np.array(rewards)[:, 0], atol=1e-7)
     state = loco.world.state
     moved = state.position[0] - [0.3, 0.4, 0.0]
@@ -409,22 +404,21 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
     pitch, middle = origin[1, 0], origin[0, 1] + TILE_SIZE / 2
     xy = np.array([[2.35, middle + 0.3], [2.35 + pitch, middle - 0.3]])
     loco.place(np.arange(2), xy, np.array([0.4, -0.4]), loco.clock.clock.copy())
-    swap, flip = task.action_mirror
     for _ in range(20):
         loco.act(np.tile(rng.normal(0.0, 0.5, 12), (2, 1)))
-        loco.actions[:, 1] = mirrored(loco.actions[:, 0], (swap, flip))
+        loco.actions[:, 1] = mirrored(loco.actions[:, 0], JOINTS)
         state.position[1] = state.position[0] * [1, -1, 1] + [pitch, 2 * middle, 0.0]
         state.quaternion[1] = state.quaternion[0] * [-1, 1, -1, 1]
         state.lin_vel[1] = state.lin_vel[0] * [1, -1, 1]
         state.ang_vel[1] = state.ang_vel[0] * [-1, 1, -1]
         for joints in (state.q, state.qd):
-            joints[1] = mirrored(joints[0], (swap, flip))
+            joints[1] = mirrored(joints[0], JOINTS)
         state.foot_force[1] = state.foot_force[0, [1, 0, 3, 2]]
         state.derive()
-        task._ground = task._measure_ground()
+        task.ground = measure_ground(task.locomotion)
         first, second = task.observe()
-        np.testing.assert_allclose(second, mirrored(first, task.observation_mirror), atol=1e-4)
-    critic, where = first[task.actor_dim :], slices(CRITIC_LAYOUT)
+        np.testing.assert_allclose(second, mirrored(first, ALL), atol=1e-4)
+    critic, where = first, columns((*loco.layout, *CRITIC_LAYOUT))
     # What is compared is not all alike, neither left to right nor along x.
     probes = critic[where["terrain"]].reshape(5, 3)
     assert np.abs(probes[:, 0] - probes[:, 2]).max() > 0.04 and np.ptp(probes[:, 1]) > 0.2

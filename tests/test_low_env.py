@@ -16,18 +16,16 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.sim.commands import INDEX, default_command, gait_index
 from tdgc.sim.gaits import gait_embedding
-from tdgc.sim.geometry import read_geometry
-from tdgc.sim.robot import Array, RobotState, nominal_pose, yaw_quaternion
+from tdgc.sim.observation import columns, width
+from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import make_tile, tile_rng
 from tdgc.state import State, split
-from tdgc.tasks.low_env import (
-    CRITIC_LAYOUT,
-    LowLevelEnv,
-    LowLevelTask,
-    shallow,
-    summarise,
-)
+from tdgc.tasks.ground import measure_ground
+from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask
+from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_spaces
+from tdgc.tasks.low_statistics import summarise
 from tdgc.tasks.rules import is_fallen
+from tdgc.tasks.tiles import shallow
 
 NOMINAL = nominal_pose(RobotConfig())
 PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4, hold=1))
@@ -102,14 +100,14 @@ def test_an_action_that_is_not_finite(value: float) -> None:
 
 
 def test_observation_of_actor_and_critic() -> None:
+    """Sizes follow from the terms, without a robot."""
+    assert width(CRITIC_LAYOUT) == 40
+    without = low_spaces(dataclasses.replace(PLANE, gyro=False))[0]
+    assert without.shape == (111,)
     task = LowLevelTask(PLANE, 3, seed=0)
-    assert task.actor_dim == 74
-    assert task.obs_dim == 74 + sum(size for _, size in CRITIC_LAYOUT) == 114
+    assert (task.observation_space, task.action_space) == low_spaces(PLANE)
     task.reset(np.arange(3))
     assert task.observe().shape == (3, 114) and task.observe().dtype == np.float32
-    task.close()
-    task = LowLevelTask(dataclasses.replace(PLANE, gyro=False), 1, seed=0)
-    assert task.actor_dim == 71 and task.obs_dim == 111
     task.close()
 
 
@@ -126,12 +124,8 @@ def test_only_the_actor_has_noise_and_only_in_training() -> None:
 
 
 def critic(task: LowLevelTask) -> dict[str, Array]:
-    rows, parts, start = task.observe(), {}, task.actor_dim
-    for name, size in CRITIC_LAYOUT:
-        parts[name] = rows[:, start : start + size]
-        start += size
-    assert start == task.obs_dim
-    return parts
+    rows, where = task.observe(), columns((*task.locomotion.layout, *CRITIC_LAYOUT))
+    return {term.name: rows[:, where[term.name]] for term in CRITIC_LAYOUT}
 
 
 def test_what_the_critic_sees_of_a_known_state() -> None:
@@ -147,7 +141,7 @@ def test_what_the_critic_sees_of_a_known_state() -> None:
     loco.friction[:], loco.payload[:], loco.delay[:] = 0.5, 1.5, 0.015
     loco.world.strength[:] = 0.9
     loco.armature[:], loco.world.joint_friction[:] = 0.012, 0.1
-    task._ground = task._measure_ground()
+    task.ground = measure_ground(task.locomotion)
     seen = critic(task)
     np.testing.assert_allclose(seen["velocity"], [[1.2, 0.4, 0.2]], atol=1e-6)
     np.testing.assert_allclose(seen["angular_velocity"], [[0.1, 0.0, 0.2]], atol=1e-6)
@@ -171,7 +165,7 @@ def test_the_critic_sees_a_step_ahead() -> None:
     task.locomotion.world.upload_terrain()
     for yaw, ahead in ((0.0, True), (math.pi, False)):
         put(task, 0, (3.65, 4.0), yaw)
-        task._ground = task._measure_ground()
+        task.ground = measure_ground(task.locomotion)
         probes = critic(task)["terrain"].reshape(5, 3)
         lift = 0.5 if ahead else 0.0
         standing = 5 * (task.locomotion.world.state.position[0, 2] - 0.30)
@@ -252,23 +246,6 @@ def test_statistics_of_a_run() -> None:
 # ------------------------------------------------------------------ how episodes end
 
 
-class Ground:
-    """A world of states only: the ground is 1 m high."""
-
-    def __init__(self, heights: list[float], forces: list[float]) -> None:
-        self.state = RobotState.zeros(read_geometry(RobotConfig()), len(heights))
-        self.state.position[:, 2] = heights
-        self.state.trunk_force[:] = forces
-
-    def support_height(self, x: Array, y: Array) -> Array:
-        return np.ones_like(x)
-
-
-def test_fall_rule() -> None:
-    world: Any = Ground([1.3, 1.151, 1.149, 1.3, 1.3, 0.5], [0.0, 0.0, 0.0, 40.0, 40.1, 0.0])
-    assert is_fallen(world).tolist() == [False, False, True, False, True, True]
-
-
 def test_a_robot_without_strength_falls() -> None:
     task = begin(PLANE, 2)
     task.locomotion.world.strength[1] = 0.0
@@ -314,13 +291,13 @@ def test_a_robot_in_a_trench_has_failed_and_one_on_a_step_has_not() -> None:
 def test_twenty_seconds_and_no_more() -> None:
     task = begin(PLANE, 2)
     assert task.horizon == 1000
-    task.elapsed[:] = [998, 500]
+    task.episodes.elapsed[:] = [998, 500]
     _, terminated, truncated = task.step(still(task))
     assert not terminated.any() and not truncated.any()
     _, terminated, truncated = task.step(still(task))
     assert not terminated.any() and truncated.tolist() == [True, False]
     task.reset(np.array([0]))
-    assert task.elapsed.tolist() == [0, 502]
+    assert task.episodes.elapsed.tolist() == [0, 502]
     task.close()
 
 
@@ -328,11 +305,11 @@ def test_a_fall_at_the_last_step_is_a_fall() -> None:
     task = begin(PLANE)
     task.locomotion.world.strength[:] = 0.0
     for _ in range(60):
-        task.elapsed[:] = 998
+        task.episodes.elapsed[:] = 998
         _, terminated, truncated = task.step(still(task))
         if terminated[0]:
             break
-    task.elapsed[:] = 999
+    task.episodes.elapsed[:] = 999
     _, terminated, truncated = task.step(still(task))
     assert terminated.tolist() == [True] and truncated.tolist() == [False]
     task.close()
@@ -355,7 +332,7 @@ def test_leaving_the_tile_truncates(spot: tuple[float, float]) -> None:
 
 def test_commands_are_drawn_anew_every_five_seconds() -> None:
     task = begin(PLANE, 3)
-    task.elapsed[:] = [0, 248, 100]
+    task.episodes.elapsed[:] = [0, 248, 100]
     first = task.locomotion.command.copy()
     task.step(still(task))
     assert (task.locomotion.command == first).all()
@@ -370,14 +347,14 @@ def test_commands_are_drawn_anew_every_five_seconds() -> None:
 def test_a_reset_leaves_the_other_robots_alone() -> None:
     """Even those whose commands were drawn in this very step."""
     task = begin(PLANE, 3, training=True)
-    task.elapsed[:] = [10, 249, 500]
+    task.episodes.elapsed[:] = [10, 249, 500]
     task.step(still(task))
-    command, elapsed = task.locomotion.command.copy(), task.elapsed.copy()
+    command, elapsed = task.locomotion.command.copy(), task.episodes.elapsed.copy()
     speed = task.locomotion.world.state.lin_vel.copy()
     task.reset(np.array([0]))
     assert (task.locomotion.command[1:] == command[1:]).all()
     assert (task.locomotion.command[0] != command[0]).any()
-    assert (task.elapsed[1:] == elapsed[1:]).all() and task.elapsed[0] == 0
+    assert (task.episodes.elapsed[1:] == elapsed[1:]).all() and task.episodes.elapsed[0] == 0
     assert (task.locomotion.world.state.lin_vel[1:] == speed[1:]).all()
     task.close()
 
@@ -386,62 +363,9 @@ def test_no_commands_are_drawn_when_the_interval_is_none() -> None:
     task = begin(dataclasses.replace(PLANE, command_seconds=0.0))
     first = task.locomotion.command.copy()
     for elapsed in (249, 250, 499):
-        task.elapsed[:] = elapsed
+        task.episodes.elapsed[:] = elapsed
         task.step(still(task))
     assert (task.locomotion.command == first).all()
-    task.close()
-
-
-def test_commands_fill_their_ranges() -> None:
-    task = LowLevelTask(PLANE, 1, seed=0, training=False)
-    bounds = np.array(dataclasses.astuple(PLANE.commands))
-    drawn = []
-    for _ in range(600):
-        task._draw_commands(np.arange(1))
-        drawn.append(task.locomotion.command[0].copy())
-    values = np.array(drawn)
-    width = bounds[:, 1] - bounds[:, 0]
-    assert (values[:, :12] >= bounds[:, 0]).all() and (values[:, :12] <= bounds[:, 1]).all()
-    assert (values[:, :12].min(axis=0) < bounds[:, 0] + 0.05 * width).all()
-    assert (values[:, :12].max(axis=0) > bounds[:, 1] - 0.05 * width).all()
-    standing = (values[:, :3] == 0.0).all(axis=1).mean()
-    assert 0.05 < standing < 0.16
-    # 0.2, 0.2, 0.3 and 0.3 of the 19 in 20 that do not leap; the others pronk. Three deviations.
-    counts = np.bincount(gait_index(values), minlength=4)
-    np.testing.assert_allclose(counts, [114, 144, 171, 171], atol=36)
-    task.close()
-
-
-def test_training_begins_with_a_share_of_the_velocity_ranges() -> None:
-    config = dataclasses.replace(PLANE, command_start=0.25)
-    task = LowLevelTask(config, 1, seed=0)
-    assert task.command_share.tolist() == [0.25] * 4
-    task.command_share[2] = 1.0
-    drawn = []
-    for _ in range(400):
-        task._draw_commands(np.arange(1))
-        drawn.append(task.locomotion.command[0].copy())
-    values = np.array(drawn)
-    paces = gait_index(values) == 2
-    assert np.abs(values[~paces, 0]).max() <= 0.25 and np.abs(values[paces, 0]).max() > 0.7
-    assert np.abs(values[:, INDEX["body_height"]]).max() > 0.029  # others have their full range
-    task.close()
-
-
-def test_velocity_ranges_grow_for_a_gait_that_does_well() -> None:
-    task = LowLevelTask(dataclasses.replace(PLANE, command_start=0.4), 4, seed=0)
-    weights = PLANE.rewards
-    columns = task._gait_scores.shape[1]
-    perfect = np.array([1.0, weights.track_lin_vel, weights.track_yaw_rate, 1.0])[:columns]
-    task._gait_scores[:] = [1000 * perfect, 0 * perfect, 10 * perfect, 1000 * perfect]
-    task._gait_scores[3, 1] *= 0.3  # bad at following velocities
-    task._grow_commands()
-    np.testing.assert_allclose(task.command_share, [0.45, 0.4, 0.4, 0.4], atol=1e-12)
-    assert (task._gait_scores[[0, 3]] == 0.0).all() and task._gait_scores[2, 0] == 10
-    task.command_share[0] = 0.98
-    task._gait_scores[0] = 1000 * perfect
-    task._grow_commands()
-    assert task.command_share[0] == 1.0
     task.close()
 
 
@@ -449,13 +373,13 @@ def test_velocity_ranges_grow_for_a_gait_that_does_well() -> None:
 def test_a_crossing_robot_is_sent_to_its_waypoint(yaw: float) -> None:
     task = begin(TILES, 2)
     assert task.field is not None
-    task._crossing[:] = [True, False]
+    task.episodes.crossing[:] = [True, False]
     put(task, 0, (2.0, 3.5), yaw)
     free = task.locomotion.command[1].copy()
-    task._speed[:], task._facing[:] = 0.5, 0.4
+    task.episodes.speed[:], task.episodes.facing[:] = 0.5, 0.4
     origin = task.field.origin(0, 0)
-    task._waypoint[0] = origin + [7.25, 4.5]
-    task._steer_crossings()
+    task.episodes.waypoint[0] = origin + [7.25, 4.5]
+    task.crossings.steer(task.locomotion, task.ground)
     vx, vy, turning = task.locomotion.command[0, :3]
     c, s = math.cos(yaw), math.sin(yaw)
     world = np.array([c * vx - s * vy, s * vx + c * vy])
@@ -474,13 +398,13 @@ def test_crossing_velocities_keep_their_direction_within_the_ranges() -> None:
     """Going sideways at 1 m/s is asked for at the 0.6 m/s that vy allows."""
     task = begin(TILES)
     assert task.field is not None
-    task._crossing[:], task._facing[:], task._speed[:] = True, 0.0, 1.0
+    task.episodes.crossing[:], task.episodes.facing[:], task.episodes.speed[:] = True, 0.0, 1.0
     put(task, 0, (2.0, 4.0), -math.pi / 2)
-    task._waypoint[0] = task.field.origin(0, 0) + [7.25, 4.0]
-    task._steer_crossings()
+    task.episodes.waypoint[0] = task.field.origin(0, 0) + [7.25, 4.0]
+    task.crossings.steer(task.locomotion, task.ground)
     np.testing.assert_allclose(task.locomotion.command[0, :3], [0.0, 0.6, 1.0], atol=1e-9)
     put(task, 0, (2.0, 4.0), -math.pi / 4)
-    task._steer_crossings()
+    task.crossings.steer(task.locomotion, task.ground)
     np.testing.assert_allclose(task.locomotion.command[0, :2], [0.6, 0.6], atol=1e-9)
     task.close()
 
@@ -488,15 +412,15 @@ def test_crossing_velocities_keep_their_direction_within_the_ranges() -> None:
 def test_an_episode_ends_with_the_crossing() -> None:
     task = begin(dataclasses.replace(TILES, families=("tilt",)))
     assert task.field is not None
-    task._crossing[:] = True
+    task.episodes.crossing[:] = True
     origin = task.field.origin(0, 0)
-    task._waypoint[0] = origin + [7.25, 4.4]
+    task.episodes.waypoint[0] = origin + [7.25, 4.4]
     put(task, 0, (6.7, 4.4))
-    task._steer_crossings()
-    assert not task._reached[0]
+    task.crossings.steer(task.locomotion, task.ground)
+    assert not task.episodes.reached[0]
     assert not task.step(still(task))[2][0]
     put(task, 0, (6.8, 4.4))
-    task._steer_crossings()
+    task.crossings.steer(task.locomotion, task.ground)
     assert task.reached[0]
     _, terminated, truncated = task.step(still(task))
     assert truncated[0] and not terminated[0]
@@ -509,7 +433,7 @@ def test_crossing_robots_face_where_they_are_asked_to() -> None:
     """So that the first command asks for no more than a small turn."""
     task = LowLevelTask(TILES, 10, seed=3, training=False)
     task.reset(np.arange(10))
-    crossing = task._crossing
+    crossing = task.episodes.crossing
     assert 0.5 < crossing.mean() <= 1.0
     turning = np.abs(task.locomotion.command[crossing, INDEX["yaw_rate"]])
     assert turning.max() < 0.85  # 0.5 rad of the start's yaw, 0.3 of the goal's bearing
@@ -525,7 +449,7 @@ class Pushes:
         task.locomotion.world.push = self.record  # type: ignore[method-assign]
 
     def record(self, index: Array, velocity: Array) -> None:
-        self.seen += [(int(i), int(self.task.elapsed[i]), v.copy()) for i, v in
+        self.seen += [(int(i), int(self.task.episodes.elapsed[i]), v.copy()) for i, v in
                       zip(index, velocity, strict=True)]  # fmt: skip
         self._push(index, velocity)
 
@@ -574,7 +498,9 @@ def test_each_robot_has_a_tile_of_its_family_and_level() -> None:
     assert (task.level >= 0).all() and (task.level < 3).all()
     for i, family in enumerate(("rough", "stair", "gap", "tilt"), start=1):
         level = int(task.level[i])
-        tile = shallow(make_tile(family, level / 10, tile_rng(7, family, level, i - 1)), level)
+        tile = shallow(
+            make_tile(family, level / 10, tile_rng(7, family, level, i - 1)), level, 0.05
+        )
         crop = slice(40, 121)  # 2 m at either side
         assert (task.field.heights[161 * i : 161 * (i + 1)] == tile.heights[:, crop]).all()
     for i in (0, 5):
@@ -610,7 +536,7 @@ def test_robots_of_flat_tiles_are_free_and_start_in_the_middle() -> None:
     config = dataclasses.replace(TILES, families=("flat", "tilt"))
     task = begin(config, 40, training=True)
     assert task.field is not None
-    assert not task._crossing[0::2].any() and task._crossing[1::2].any()
+    assert not task.episodes.crossing[0::2].any() and task.episodes.crossing[1::2].any()
     local = task.locomotion.world.state.position[:, :2] - task.field.origin(np.arange(40), 0)
     np.testing.assert_allclose(local[0::2], 4.0)
     np.testing.assert_allclose(local[1::2, 0], 0.75)
@@ -624,7 +550,7 @@ def test_penalties_fall_as_the_commands_of_a_gait_grow() -> None:
     """From all of them to half, each gait on its own."""
     task = begin(PLANE, 4)
     task.locomotion.command[:, 12:] = gait_embedding([0, 1, 2, 3])
-    task.command_share[:] = [0.4, 0.7, 0.85, 1.0]
+    task.commands.share[:] = [0.4, 0.7, 0.85, 1.0]
     np.testing.assert_allclose(task._penalty(), [1.0, 0.75, 0.625, 0.5])
     task.close()
 
@@ -638,7 +564,7 @@ def test_penalties_count_least_on_relief() -> None:
         task = LowLevelTask(config, 1, seed=0, training=False)
         task.level[:] = 0
         task.reset(np.arange(1))
-        task._crossing[:] = False
+        task.episodes.crossing[:] = False
         task.locomotion.command[:] = default_command()
         put(task, 0, (4.0, 4.0))
         rewarded[family] = float(task.step(still(task))[0][0])
@@ -651,12 +577,12 @@ def test_penalties_count_least_on_relief() -> None:
 
 def test_most_crossings_of_trenches_leap() -> None:
     task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 400)
-    pronks = (gait_index(task.locomotion.command) == 1) & task._crossing
+    pronks = (gait_index(task.locomotion.command) == 1) & task.episodes.crossing
     gap = task.column == 0
-    leaps = task._leaping
+    leaps = task.episodes.leaping
     assert (leaps == (pronks & gap)).all()
-    assert 0.75 < leaps[gap & task._crossing].mean() < 0.95
-    assert (task._facing[leaps] == 0.0).all()
+    assert 0.75 < leaps[gap & task.episodes.crossing].mean() < 0.95
+    assert (task.episodes.facing[leaps] == 0.0).all()
     command = task.locomotion.command[leaps]
     # From rest they are timed for 1 m/s and strides of 0.39 m.
     np.testing.assert_allclose(command[:, INDEX["frequency"]], 1.0 / 0.39, atol=0.05)
@@ -678,12 +604,15 @@ def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> 
         (5, [(0.13, 0.24), (-0.015, 0.05), (-0.195, 0.195), (-1.0, 1.0)]),
         (10, [(0.18, 0.24), (0.0, 0.05), (-0.09, 0.09), (-1.0, 1.0)]),
     ):
-        task.level[:], task._crossing[:] = level, [True, False]
-        low, high = task._bounds(np.array([0, 1]))
+        task.level[:], task.episodes.crossing[:] = level, [True, False]
+        wide = task.commands.bounds(2)
+        _, low, high = narrowed = task.commands.bounds(2)
+        task.crossings.narrow(np.arange(2), task.level, *narrowed)
         np.testing.assert_allclose(low[0, columns], [b[0] for b in bounds], atol=1e-12)
         np.testing.assert_allclose(high[0, columns], [b[1] for b in bounds], atol=1e-12)
-        np.testing.assert_array_equal([low[1], high[1]], [task._low, task._high])
-    task.level[:], task._crossing[:] = 10, True
+        for left, before in zip(narrowed, wide, strict=True):
+            np.testing.assert_array_equal(left[1], before[1])
+    task.level[:], task.episodes.crossing[:] = 10, True
     for _ in range(20):
         task._draw_commands(np.arange(2))
         assert (task.locomotion.command[:, INDEX["swing_height"]] >= 0.18).all()
@@ -697,14 +626,18 @@ def test_pitch_follows_the_slope_of_a_crossing() -> None:
     assert task.field is not None
     task.level[:] = 10
     task.reset(np.arange(2))
-    task._crossing[:], task._follow[:], task._pitch[:] = True, [0.5, 0.0], 0.05
+    task.episodes.crossing[:], task.episodes.follow[:], task.episodes.pitch[:] = (
+        True,
+        [0.5, 0.0],
+        0.05,
+    )
     risers = task.field.features[0, 0].risers
     put(task, 0, (risers[2:4, 0].mean(), 4.0))
     put(task, 1, (risers[2:4, 0].mean(), 4.0))
-    task._ground = task._measure_ground()
-    slope = task._slope_ahead()[0]
+    task.ground = measure_ground(task.locomotion)
+    slope = task.ground.slope()[0]
     assert 0.25 < slope < 0.6  # 15 cm in 25 to 40
-    task._steer_crossings()
+    task.crossings.steer(task.locomotion, task.ground)
     pitch = task.locomotion.command[:, INDEX["pitch"]]
     np.testing.assert_allclose(pitch, [0.05 - 0.5 * slope, 0.05])
     task.close()
@@ -713,10 +646,10 @@ def test_pitch_follows_the_slope_of_a_crossing() -> None:
 def test_trenches_are_shallow_on_easy_levels_of_training() -> None:
     rng = np.random.default_rng(0)
     for level, depth in ((0, 0.05), (4, 0.138), (10, 0.6)):
-        tile = shallow(make_tile("gap", level / 10, rng), level)
+        tile = shallow(make_tile("gap", level / 10, rng), level, 0.05)
         assert tile.heights.min() == pytest.approx(-depth)
     tilt = make_tile("tilt", 1.0, rng)
-    assert (shallow(tilt, 0).heights == tilt.heights).all()
+    assert (shallow(tilt, 0, 0.05).heights == tilt.heights).all()
 
 
 def ended(
@@ -737,8 +670,8 @@ def ended(
         position = task.locomotion.world.state.position.copy()
         position[0, 2] = 0.1
         task.locomotion.world.reset_robots([0], position, upside_down, NOMINAL[None])
-    task._crossing[:], task._reached[:] = crossing, reached
-    task.level[:], task.elapsed[:], task._began[:] = level, elapsed, began
+    task.episodes.crossing[:], task.episodes.reached[:] = crossing, reached
+    task.level[:], task.episodes.elapsed[:], task.episodes.began[:] = level, elapsed, began
     _, terminated, _ = task.step(still(task))
     assert bool(terminated[0]) == falls
     level = int(task.level[0])
@@ -814,10 +747,10 @@ def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
     live(task, 40)
     while task.locomotion.world.state.foot_force.max() < 1.0:
         live(task, 1)
-    task.command_share[1] = 0.65
-    assert (task.elapsed > task._began).any()
-    task._next_push[0] = 0
-    task._push()
+    task.commands.share[1] = 0.65
+    assert (task.episodes.elapsed > task.episodes.began).any()
+    task.episodes.next_push[0] = 0
+    task.pushes.push(task.locomotion.world, task.episodes.elapsed, np.ones(3))
     state = task.state_dict()
     assert state["episodes"]["locomotion"]["foot_force"].max() > 1.0
     kept = flat(state)
@@ -836,11 +769,31 @@ def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
     other.close()
 
 
+def test_a_checkpoint_names_what_it_holds() -> None:
+    """Runs are resumed by later versions, so names, sizes and kinds of numbers stay."""
+    task = begin(TILES, 3, training=True)
+    state = task.state_dict()
+    episodes = state.pop("episodes")
+    for part in ("locomotion", "tiles"):
+        assert episodes.pop(part)
+    assert set(state) == {"rng", "landing", "tiles_drawn", "level", "command_share"}
+    assert len(state["landing"]) == 2 and state["command_share"].shape == (4,)
+    held = {name: f"{array.dtype} {array.shape}" for name, array in episodes.items()}
+    whole, flags, numbers = "int64 (3,)", "bool (3,)", "float64 (3,)"
+    assert held == {
+        "elapsed": whole, "began": whole, "next_push": whole,
+        "crossing": flags, "leaping": flags, "reached": flags, "was_contact": "bool (3, 4)",
+        "speed": numbers, "follow": numbers, "pitch": numbers, "facing": numbers,
+        "waypoint": "float64 (3, 2)", "origin": "float64 (3, 2)", "gait_scores": "float64 (4, 4)",
+    }  # fmt: skip
+    task.close()
+
+
 def test_new_episodes_begin_from_a_state_without_any() -> None:
     """As where a phase of a run ends, with lists for arrays."""
     task, other = (LowLevelTask(PLANE, 3, seed=5) for _ in range(2))
     task.level[:] = [3, 1, 0]
-    task.command_share[1] = 0.65
+    task.commands.share[1] = 0.65
     state = task.state_dict()
     old = {
         "rng": state["rng"], "tiles_drawn": 0, "landing": state["landing"],
@@ -877,9 +830,9 @@ def test_restart_draws_new_tiles_at_the_present_levels() -> None:
 def test_restart_spreads_the_ends_of_episodes() -> None:
     task = LowLevelTask(PLANE, 10, seed=0)
     task.restart()
-    assert task.elapsed.min() < 250 and task.elapsed.max() > 750
-    assert (task._began == task.elapsed).all()
-    assert (task._next_push > task.elapsed).all()
+    assert task.episodes.elapsed.min() < 250 and task.episodes.elapsed.max() > 750
+    assert (task.episodes.began == task.episodes.elapsed).all()
+    assert (task.episodes.next_push > task.episodes.elapsed).all()
     task.close()
 
 

@@ -38,9 +38,11 @@ from tdgc.learn.flags import add_arguments, configure
 from tdgc.learn.run import Interruption, append_line
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
-from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
+from tdgc.policies import AsymmetricActorCriticPolicy
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import width
 from tdgc.tasks.high_env import PRETRAINED
-from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import low_mirror, low_spaces
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -245,27 +247,27 @@ def test_a_signal_asks_to_stop_and_a_second_one_stops(number: signal.Signals) ->
 def test_the_policy_is_symmetric(tmp_path: Path) -> None:
     """Mirrored observation, mirrored action, same value: before and after a change of weights,
     and in the saved file."""
-    task = LowLevelTask(LowTrainConfig().env, 1, seed=0)
-    (obs_index, obs_sign), (act_index, act_sign) = task.observation_mirror, task.action_mirror
-    mirror = Mirror(*(tuple(x.tolist()) for x in (obs_index, obs_sign, act_index, act_sign)))
+    config = LowTrainConfig().env
+    mirror, actor_dim = low_mirror(config), width(actor_layout(config.gyro))
     policy = AsymmetricActorCriticPolicy(
-        task.observation_space, task.action_space, lambda _: 1e-3, actor_dim=task.actor_dim,
+        *low_spaces(config), lambda _: 1e-3, actor_dim=actor_dim,
         mirror=mirror, net_arch={"pi": [16], "vf": [16]},
     )  # fmt: skip
-    task.close()
-    seen = th.randn(5, task.obs_dim)
-    image = seen[:, obs_index] * th.from_numpy(obs_sign)
+    seen = th.randn(5, len(mirror.obs_index))
+    image = seen[:, mirror.obs_index] * th.tensor(mirror.obs_sign)
     for _ in range(2):
         with th.no_grad():
             for tensor in policy.parameters():
                 tensor.add_(0.3 * th.randn_like(tensor))
             action = policy.get_distribution(seen).mode()
             mirrored = policy.get_distribution(image).mode()
-            th.testing.assert_close(mirrored, action[:, act_index] * th.from_numpy(act_sign))
+            th.testing.assert_close(
+                mirrored, action[:, mirror.action_index] * th.tensor(mirror.action_sign)
+            )
             assert (mirrored - action).abs().max() > 0.1
             th.testing.assert_close(policy.predict_values(image), policy.predict_values(seen))
     policies.save(tmp_path / "policy", policy, {})
-    given, _ = policies.load(tmp_path / "policy").predict(seen[:, : task.actor_dim].numpy())
+    given, _ = policies.load(tmp_path / "policy").predict(seen[:, :actor_dim].numpy())
     wanted = action.clamp(-4.0, 4.0).numpy()
     np.testing.assert_allclose(given, wanted, atol=1e-5)
 

@@ -35,7 +35,6 @@ class Counter:
     its actions.
     """
 
-    actor_dim = 3
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 
@@ -247,14 +246,14 @@ from pathlib import Path
 import torch
 from tdgc.config import LowLevelConfig
 from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import low_spaces
 from tdgc.parallel.vec import TaskVecEnv
 
 class Own(LowLevelTask):
     pass
 
 if __name__ == "__main__":
-    probe = LowLevelTask(LowLevelConfig(), 1, 0)
-    spaces = probe.observation_space, probe.action_space
+    spaces = low_spaces(LowLevelConfig())
     for task in (LowLevelTask, Own):
         env = TaskVecEnv(functools.partial(task, LowLevelConfig()), 1, 1, 0, spaces)
         print("libtorch" in Path(f"/proc/{env.worker_pids[0]}/maps").read_text())

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tdgc.benchmark.memory import Clock, Delay, Obstacles, Profile, Reckoning
 from tdgc.config import HighLevelConfig, LowLevelConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
+from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, ZONE
 from tdgc.tasks.high_env import GOAL_SCALE, SEMANTIC, high_layout
@@ -81,16 +82,15 @@ class CuesLaw:
         self._dt = self._steps * self._control_dt
         self._points = PROBES[config.probes]
         self._ahead = self._points[:, 1] == 0.0
-        self._parts = high_layout(config.cues)
+        self._columns = columns(high_layout(config.cues))
         self._decoder = CommandDecoder(low.commands, config.action_limit)
 
     def predict(
         self, obs: NDArray[np.floating], state: Memory | None = None
     ) -> tuple[Array, Memory]:
         """Actions (M, 13) from o^H (M, 86), and what is remembered for the next decision."""
-        ends = np.cumsum([size for _, size in self._parts])[:-1]
-        parts = np.split(np.asarray(obs, dtype=np.float64), ends, axis=1)
-        cue = dict(zip((name for name, _ in self._parts), parts, strict=True))
+        rows = np.asarray(obs, dtype=np.float64)
+        cue = {name: rows[:, place] for name, place in self._columns.items()}
         distance = cue["goal"][:, 0] / GOAL_SCALE
         bearing = np.arctan2(cue["goal"][:, 2], cue["goal"][:, 1])
         if state is None:

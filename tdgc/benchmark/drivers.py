@@ -21,6 +21,7 @@ from tdgc.config import (
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.observation import width
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.tasks.high_env import SEMANTIC, high_layout, observe_high, paired
@@ -226,9 +227,8 @@ def load_high(
             raise ConfigError(
                 f"{path}: trained for a low level with robot.{field.name} {wanted}, not {given}"
             )
-    size = sum(width for _, width in high_layout(config.cues))
     for what, wanted, given in (
-        ("a high level that observes {} values", size, high.obs_dim),
+        ("a high level that observes {} values", width(high_layout(config.cues)), high.obs_dim),
         ("a low level that observes {} values", observation, low.actor_dim),
         (
             "a low level with a control step of {} s",

@@ -27,7 +27,6 @@ class TaskGroup:
 
     def __init__(self, tasks: Sequence[Task]) -> None:
         self.tasks = list(tasks)
-        self.actor_dim = tasks[0].actor_dim
         self.observation_space = tasks[0].observation_space
         self.action_space = tasks[0].action_space
         bounds = [0, *itertools.accumulate(task.num_robots for task in tasks)]

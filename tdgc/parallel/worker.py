@@ -47,7 +47,6 @@ class Task(Protocol):
     """
 
     num_robots: int
-    actor_dim: int
     observation_space: gym.spaces.Box[Any]
     action_space: gym.spaces.Box[Any]
 

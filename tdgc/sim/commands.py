@@ -38,6 +38,8 @@ NUM_ACTIONS = len(CONTINUOUS) + 1  # 12 continuous and the gait channel
 NUM_COMMANDS = len(NAMES)
 #: Position of each command in the vector, by name.
 INDEX = {name: i for i, name in enumerate(NAMES)}
+#: Those that change sign in a left-right mirror.
+SIDEWAYS = ("vy", "yaw_rate", "roll")
 
 
 def default_command() -> NDArray[np.float64]:

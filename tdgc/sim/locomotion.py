@@ -14,8 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
-from tdgc.sim.commands import INDEX, NUM_COMMANDS, default_command, gait_index, observed_command
+from tdgc.sim.commands import (
+    INDEX,
+    NAMES,
+    SIDEWAYS,
+    default_command,
+    gait_index,
+    observed_command,
+)
 from tdgc.sim.gaits import GAITS, PhaseClock
+from tdgc.sim.observation import ARROW, JOINTS, LEGS, TURN, Term, in_place, observe
 from tdgc.sim.robot import (
     NUM_JOINTS,
     Array,
@@ -30,65 +38,10 @@ from tdgc.sim.terrain import TileField
 from tdgc.sim.world import World
 from tdgc.state import State, copies, fill
 
-SPEED_SCALE = 0.05  # joint speed as the networks see it (Walk These Ways)
-GYRO_SCALE = 0.25  # angular velocity likewise
+SPEED_SCALE = 0.05  # s/rad, joint speed as the networks see it (Walk These Ways)
+GYRO_SCALE = 0.25  # s/rad, angular velocity likewise
 _FREQUENCY = INDEX["frequency"]
 _HISTORY = 3  # control steps of targets kept: the step, and two before for latency up to 40 ms
-
-#: Names and sizes of the actor's observation in order: s^L of Sec. IV-A.
-ACTOR_LAYOUT = (
-    ("gravity", 3),
-    ("joint_error", NUM_JOINTS),
-    ("joint_speed", NUM_JOINTS),
-    ("last_action", NUM_JOINTS),
-    ("action_before", NUM_JOINTS),
-    ("command", NUM_COMMANDS),
-    ("clock", 4),
-    ("gait", 1),
-)
-GYRO_LAYOUT = (("gyro", 3),)
-
-_LEG_SWAP = (1, 0, 3, 2)
-_JOINT_SWAP = tuple(3 * leg + j for leg in _LEG_SWAP for j in range(3))
-_JOINT_SIGN = (-1.0, 1.0, 1.0) * 4
-_COMMAND_SIGN = tuple(
-    -1.0 if i in (INDEX["vy"], INDEX["yaw_rate"], INDEX["roll"]) else 1.0
-    for i in range(NUM_COMMANDS)
-)
-_IDENTITY = {n: tuple(range(n)) for n in (1, 3, NUM_COMMANDS)}
-
-#: How each part of an observation looks in a left-right mirror: (source index, sign).
-MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
-    "gravity": (_IDENTITY[3], (1.0, -1.0, 1.0)),
-    "joint_error": (_JOINT_SWAP, _JOINT_SIGN),
-    "joint_speed": (_JOINT_SWAP, _JOINT_SIGN),
-    "last_action": (_JOINT_SWAP, _JOINT_SIGN),
-    "action_before": (_JOINT_SWAP, _JOINT_SIGN),
-    "command": (_IDENTITY[NUM_COMMANDS], _COMMAND_SIGN),
-    "clock": (_LEG_SWAP, (1.0,) * 4),
-    "gait": (_IDENTITY[1], (1.0,)),
-    "gyro": (_IDENTITY[3], (-1.0, 1.0, -1.0)),
-}
-
-
-def mirror_map(
-    layout: tuple[tuple[str, int], ...],
-    mirrors: dict[str, tuple[tuple[int, ...], tuple[float, ...]]],
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Index and sign with which ``sign * x[..., index]`` is ``x`` seen in a mirror."""
-    index: list[int] = []
-    sign: list[float] = []
-    for name, size in layout:
-        source, signs = mirrors[name]
-        assert len(source) == len(signs) == size, name
-        index += [len(sign) + s for s in source]
-        sign += signs
-    return np.array(index), np.array(sign, dtype=np.float32)
-
-
-def action_mirror() -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """The same for the 12 actions."""
-    return np.array(_JOINT_SWAP), np.array(_JOINT_SIGN, dtype=np.float32)
 
 
 class Locomotion:
@@ -100,6 +53,7 @@ class Locomotion:
         targets: (3, M, 12) rad, joint targets of the last step and the two before.
         carried_out: (M, 15), what ``executed`` was in the last control step.
         frequency_limit: Hz, that the start of a gait is not hurried beyond.
+        layout: terms of ``observe``'s rows.
         delay: (M,) s of latency; joint_offset: (M, 12) rad; friction, payload: (M,); armature:
             (M,) kg m^2.
     """
@@ -116,7 +70,7 @@ class Locomotion:
         self.num_robots = num_robots
         self.robot = robot
         self.physics = physics
-        self.gyro = gyro
+        self.layout = actor_layout(gyro)
         self.world = World(num_robots, robot, physics, field, visual)
         self.clock = PhaseClock(num_robots)
         self.nominal = nominal_pose(robot)
@@ -135,11 +89,6 @@ class Locomotion:
         self._feet, _ = foot_kinematics(geometry, self.nominal[None], np.zeros((1, NUM_JOINTS)))
         self._stand = geometry.foot_radius - self._feet[0, :, 2].min()
         self._pose = self._pose_of = np.empty(0)  # the last ``pose`` and what it followed from
-
-    @property
-    def layout(self) -> tuple[tuple[str, int], ...]:
-        """Names and sizes of the parts of ``observe``'s rows."""
-        return ACTOR_LAYOUT + (GYRO_LAYOUT if self.gyro else ())
 
     def swing(self) -> Array:
         """Profile of the swing, (M, 4): height of each foot as a share of the commanded apex."""
@@ -281,31 +230,41 @@ class Locomotion:
         self.world.forget()
 
     def observe(self, noise: Noise | None = None) -> NDArray[np.float32]:
-        """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g], (M, 71), and 3 more with a gyro.
-
-        With ``noise`` the measured parts carry it; it is uniform.
-        """
-        state = self.world.state
+        """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g], (M, 71), and 3 more with a gyro; what
+        is measured carries the ``noise``."""
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
-        gravity = state.gravity
-        error = state.q - self.joint_offset - self.pose()
-        speed = state.qd
-        gyro = np.einsum("mji,mj->mi", state.rotation, state.ang_vel)
-        if noise is not None:
-            gravity = gravity + noise.draw(noise.config.noise_gravity, gravity.shape)
-            error = error + noise.draw(noise.config.noise_joint_angle, error.shape)
-            speed = speed + noise.draw(noise.config.noise_joint_speed, speed.shape)
-            gyro = gyro + noise.draw(noise.config.noise_gyro, gyro.shape)
-        parts = [
-            gravity,
-            error,
-            SPEED_SCALE * speed,
-            self.actions[0],
-            self.actions[1],
-            observed_command(self.executed()),
-            self.clock.signal(),
-            gait_index(self.command)[:, None] / (len(GAITS) - 1),
-        ]
-        if self.gyro:
-            parts.append(GYRO_SCALE * gyro)
-        return np.concatenate(parts, axis=1).astype(np.float32)
+        return observe(self.layout, self, noise)
+
+
+def _joint_error(loco: Locomotion) -> Array:
+    return loco.world.state.q - loco.joint_offset - loco.pose()
+
+
+def _command(loco: Locomotion) -> Array:
+    return observed_command(loco.executed())
+
+
+def _gait(loco: Locomotion) -> Array:
+    return gait_index(loco.command)[:, None] / (len(GAITS) - 1)
+
+
+_FLIP_COMMAND = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in NAMES))
+# fmt: off
+_ACTOR_LAYOUT: tuple[Term[Locomotion], ...] = (
+    Term("gravity", 3, lambda loco: loco.world.state.gravity, 1.0, "noise_gravity", ARROW),
+    Term("joint_error", 12, _joint_error, 1.0, "noise_joint_angle", JOINTS),
+    Term("joint_speed", 12, lambda loco: loco.world.state.qd, SPEED_SCALE, "noise_joint_speed",
+         JOINTS),
+    Term("last_action", 12, lambda loco: loco.actions[0], mirror=JOINTS),
+    Term("action_before", 12, lambda loco: loco.actions[1], mirror=JOINTS),
+    Term("command", 15, _command, mirror=_FLIP_COMMAND),
+    Term("clock", 4, lambda loco: loco.clock.signal(), mirror=LEGS),
+    Term("gait", 1, _gait),
+    Term("gyro", 3, lambda loco: loco.world.state.body_rate, GYRO_SCALE, "noise_gyro", TURN),
+)
+# fmt: on
+
+
+def actor_layout(gyro: bool) -> tuple[Term[Locomotion], ...]:
+    """s^L of Sec. IV-A, the actor's observation: 71 values, and 3 more with a gyro."""
+    return tuple(term for term in _ACTOR_LAYOUT if gyro or term.name != "gyro")

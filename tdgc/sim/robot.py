@@ -229,6 +229,11 @@ class RobotState:
         state.derive()
         return state
 
+    @property
+    def body_rate(self) -> Array:
+        """Angular velocity in the body frame, as a gyro has it, (M, 3) rad/s."""
+        return np.einsum("mji,mj->mi", self.rotation, self.ang_vel)
+
     def derive(self) -> None:
         """Fill the fields that follow from the measured ones.
 

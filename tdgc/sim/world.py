@@ -518,6 +518,15 @@ class World:
         self._clients.clear()
 
 
+def check_robot(robot: RobotConfig, physics: PhysicsConfig) -> None:
+    """See that such a robot can be simulated.
+
+    Raises:
+        ConfigError: a URDF that cannot be used; names it.
+    """
+    World(1, robot, physics).close()
+
+
 class WindowError(RuntimeError):
     """Bullet's window cannot be opened, or was closed; the message is one line."""
 

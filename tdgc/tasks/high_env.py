@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -24,9 +24,10 @@ from tdgc.config import (
     recorded,
 )
 from tdgc.policies import Mirror, Policy
-from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, CommandDecoder, gait_index
+from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS, CommandDecoder, gait_index
 from tdgc.sim.gaits import GAITS
-from tdgc.sim.locomotion import MIRRORS, SPEED_SCALE, Locomotion, mirror_map
+from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
+from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, in_place, mirror, observe, width
 from tdgc.sim.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import FAMILIES, draw_start_goal
@@ -35,7 +36,6 @@ from tdgc.tasks import rewards
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.leaps import Landing
-from tdgc.tasks.low_env import TaskEnv
 from tdgc.tasks.probes import (
     NUM_PROBES,
     PROBE_RANGE,
@@ -43,7 +43,9 @@ from tdgc.tasks.probes import (
     PROBES,
     HeightProbes,
 )
+from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, has_failed, outcome
+from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.teacher import Teacher
 from tdgc.tasks.tiles import TrainingTiles
 
@@ -57,36 +59,59 @@ _GUIDANCE = 0.75  # of the imitation, so that a quarter is in what the apprentic
 SEMANTIC = (*FAMILIES, "unknown")
 
 
-def high_layout(cues: str) -> tuple[tuple[str, int], ...]:
-    """Names and sizes of the parts of the high level's observation o^H, in order."""
-    layout = [
-        ("goal", 3),
-        ("time_left", 1),
-        ("gravity", 3),
-        ("joint_error", NUM_JOINTS),
-        ("joint_speed", NUM_JOINTS),
-        ("last_action", NUM_ACTIONS),
-        ("clock", 4),
-    ]
-    if cues in ("both", "semantic"):
-        layout.append(("family", len(SEMANTIC)))
-    if cues in ("both", "geometric"):
-        layout.append(("probes", NUM_PROBES))
-    return tuple(layout)
+class _Seen(NamedTuple):
+    """What o^H is read from, see ``observe_high``."""
+
+    loco: Locomotion
+    goal: Array
+    time_share: Array
+    last_action: Array
+    families: NDArray[np.int64]
+    probes: Array
 
 
-_ACTION_SIGN = tuple(
-    -1.0 if name in ("vy", "yaw_rate", "roll") else 1.0 for name in (*CONTINUOUS, "gait")
+def _goal(seen: _Seen) -> Array:
+    state = seen.loco.world.state
+    offset = seen.goal - state.position[:, :2]
+    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
+    distance = np.linalg.norm(offset, axis=1)
+    return np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1)
+
+
+def _joint_error(seen: _Seen) -> Array:
+    return seen.loco.world.state.q - seen.loco.joint_offset - seen.loco.nominal
+
+
+_FLIP_ACTION = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in (*CONTINUOUS, "gait")))
+_LAYOUT: tuple[Term[_Seen], ...] = (
+    Term("goal", 3, _goal, mirror=in_place(1.0, 1.0, -1.0)),
+    Term("time_left", 1, lambda s: 1.0 - s.time_share[:, None]),
+    Term("gravity", 3, lambda s: s.loco.world.state.gravity, mirror=ARROW),
+    Term("joint_error", 12, _joint_error, mirror=JOINTS),
+    Term("joint_speed", 12, lambda s: s.loco.world.state.qd, SPEED_SCALE, mirror=JOINTS),
+    Term("last_action", 13, lambda s: s.last_action, mirror=_FLIP_ACTION),
+    Term("clock", 4, lambda s: s.loco.clock.signal(), mirror=LEGS),
 )
-#: How each part of ``high_layout`` looks in a left-right mirror: (source index, sign).
-_MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
-    **MIRRORS,
-    "goal": ((0, 1, 2), (1.0, 1.0, -1.0)),
-    "time_left": ((0,), (1.0,)),
-    "last_action": (tuple(range(NUM_ACTIONS)), _ACTION_SIGN),
-    "family": (tuple(range(len(SEMANTIC))), (1.0,) * len(SEMANTIC)),
-    "probes": (PROBE_SWAP, (1.0,) * NUM_PROBES),
+_PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
+_CUES: dict[str, Term[_Seen]] = {
+    "semantic": Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
+    "geometric": Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
 }
+
+
+def high_layout(cues: str) -> tuple[Term[_Seen], ...]:
+    """The terms of the high policy's observation o^H, in order."""
+    return _LAYOUT + tuple(term for cue, term in _CUES.items() if cues in ("both", cue))
+
+
+def high_spaces(
+    config: HighLevelConfig, guided: bool = False
+) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """Observations, with the teacher's actions where it guides, and actions of the high policy."""
+    size = width(high_layout(config.cues)) + guided * NUM_ACTIONS
+    limit = config.action_limit
+    seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+    return seen, gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
 
 
 def high_mirror(config: HighLevelConfig) -> Mirror:
@@ -100,16 +125,14 @@ def high_mirror(config: HighLevelConfig) -> Mirror:
             f"probes that are {config.probes} are not the same on both sides, as a symmetric "
             "policy needs them; ppo.mirror=false does without symmetry"
         )
-    for name in ("vy", "yaw_rate", "roll"):
+    for name in SIDEWAYS:
         low, high = getattr(config.commands or CommandRanges(), name)
         if low != -high:
             raise ConfigError(
                 f"commands.{name} must be the same to both sides for a symmetric policy, not "
                 f"{[low, high]}; ppo.mirror=false does without symmetry"
             )
-    index, sign = mirror_map(high_layout(config.cues), _MIRRORS)
-    actions = tuple(range(NUM_ACTIONS))
-    return Mirror(tuple(index.tolist()), tuple(sign.tolist()), actions, _ACTION_SIGN)
+    return Mirror(*mirror(high_layout(config.cues)), *_FLIP_ACTION)
 
 
 def observe_high(
@@ -121,7 +144,7 @@ def observe_high(
     cues: str,
     probes: Array,
 ) -> NDArray[np.float32]:
-    """o^H of M robots, (M, sum of ``high_layout``).
+    """o^H of M robots, (M, n), of ``high_layout``.
 
     Args:
         loco: the robots.
@@ -132,24 +155,8 @@ def observe_high(
         cues: both, semantic, geometric or none.
         probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
     """
-    state = loco.world.state
-    offset = goal - state.position[:, :2]
-    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
-    distance = np.linalg.norm(offset, axis=1)
-    parts = [
-        np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1),
-        1.0 - time_share[:, None],
-        state.gravity,
-        state.q - loco.joint_offset - loco.nominal,
-        SPEED_SCALE * state.qd,
-        last_action,
-        loco.clock.signal(),
-    ]
-    if cues in ("both", "semantic"):
-        parts.append(np.eye(len(SEMANTIC))[families])
-    if cues in ("both", "geometric"):
-        parts.append(probes / PROBE_RANGE)
-    return np.concatenate(parts, axis=1).astype(np.float32)
+    seen = _Seen(loco, goal, time_share, last_action, families, probes)
+    return observe(high_layout(cues), seen)
 
 
 def command_share(commands: Array, decoder: CommandDecoder) -> Array:
@@ -280,6 +287,8 @@ class NavigationTask:
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._reached_at = np.full(m, -1)
         self._next_push = np.zeros(m)
+        disturbed = config.randomisation, self.rng, self.step_seconds
+        self._pushes = Pushes(*disturbed, self._next_push)
         self._actions = np.zeros((2, m, NUM_ACTIONS))
         self._commands = np.zeros((3, m, 15))
         self.stats: dict[str, float] = {}
@@ -289,13 +298,7 @@ class NavigationTask:
         self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
-        size = sum(width for _, width in high_layout(config.cues))
-        self.actor_dim = size
-        if guided:
-            size += NUM_ACTIONS
-        limit = config.action_limit
-        self.action_space = gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.observation_space, self.action_space = high_spaces(config, bool(guided))
 
     def _build_robots(self) -> None:
         self.tiles.draw(np.arange(self.num_robots), self.curriculum.levels)
@@ -320,7 +323,7 @@ class NavigationTask:
         if self.training:
             width = self._width()[index]
             self.locomotion.randomise(index, self.config.randomisation, rng, width)
-            self._schedule_push(index)
+            self._pushes.schedule(index, self.elapsed)
         self._actions[:, index] = 0.0
         middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
         self._commands[:, index] = command_share(middle, self.decoder)
@@ -396,11 +399,11 @@ class NavigationTask:
             own = done[~self._led[done]]  # the teacher's episodes say nothing of the policy
             if own.size:
                 self.curriculum.push(own, reached[own])
-            self._push()
+            self._pushes.push(loco.world, self.elapsed, self._width())
         return reward, failed, truncated
 
     def observe(self) -> NDArray[np.float32]:
-        """o^H, (M, actor_dim), and with a teacher its actions, (M, 13)."""
+        """o^H, (M, n), and with a teacher its actions, (M, 13)."""
         seen = observe_high(
             self.locomotion,
             self.goal,
@@ -431,24 +434,6 @@ class NavigationTask:
             place = np.arange(self.num_robots) // len(self.config.families)
             told[place >= each * (1.0 - self.config.unknown_share)] = len(FAMILIES)
         return told
-
-    # ------------------------------------------------------------------ disturbances
-
-    def _schedule_push(self, index: NDArray[np.integer]) -> None:
-        wait = self.rng.uniform(*self.config.randomisation.push_interval, len(index))
-        self._next_push[index] = self.elapsed[index] + wait / self.step_seconds
-
-    def _push(self) -> None:
-        index = np.flatnonzero(self.elapsed >= self._next_push)
-        if not index.size:
-            return
-        r = self.config.randomisation
-        angle = self.rng.uniform(-np.pi, np.pi, index.size)
-        top = r.scale * r.push_speed * self._width()[index]
-        speed = top * self.rng.uniform(size=index.size)
-        velocity = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-        self.locomotion.world.push(index, speed[:, None] * velocity)
-        self._schedule_push(index)
 
     # ------------------------------------------------------------------ statistics, resume
 

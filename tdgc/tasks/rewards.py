@@ -186,8 +186,7 @@ def vertical_velocity(s: LowStep) -> Array:
 
 def tilt_rate(s: LowStep) -> Array:
     """Squared roll and pitch rate of the trunk, rad^2/s^2."""
-    body = np.einsum("mji,mj->mi", s.state.rotation, s.state.ang_vel)
-    return _square_sum(body[:, :2])
+    return _square_sum(s.state.body_rate[:, :2])
 
 
 def joint_torques(s: LowStep) -> Array:

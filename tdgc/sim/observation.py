@@ -1,0 +1,94 @@
+"""Observations as tables of terms: what is read, its scale, its noise, its look in a mirror.
+
+A layout is a tuple of terms in order; rows, sizes, columns and mirrors follow from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.sim.sensors import Noise
+
+S = TypeVar("S")
+
+
+class Flip(NamedTuple):
+    """How a vector looks in a left-right mirror: ``sign * x[..., source]``."""
+
+    source: tuple[int, ...]
+    sign: tuple[float, ...]
+
+
+def in_place(*sign: float) -> Flip:
+    """Of a vector whose entries stay where they are."""
+    return Flip(tuple(range(len(sign))), sign)
+
+
+#: Of vectors (ahead, left, up), of turning about these axes, and of what each leg or joint has one.
+ARROW, TURN = in_place(1.0, -1.0, 1.0), in_place(-1.0, 1.0, -1.0)
+LEGS = Flip((1, 0, 3, 2), (1.0,) * 4)
+JOINTS = Flip(tuple(3 * leg + j for leg in LEGS.source for j in range(3)), (-1.0, 1.0, 1.0) * 4)
+
+
+@dataclass(frozen=True)
+class Term(Generic[S]):
+    """A part of an observation.
+
+    Attributes:
+        name: within its layout.
+        size: n, of the network's inputs.
+        read: source -> (M, n).
+        scale: of the inputs, per unit read.
+        noise: field of ``RandomisationConfig`` with the half-width of its noise, in units read;
+            None where nothing is measured.
+        mirror: how it looks in a left-right mirror; None where that changes nothing.
+    """
+
+    name: str
+    size: int
+    read: Callable[[S], NDArray[Any]]
+    scale: float = 1.0
+    noise: str | None = None
+    mirror: Flip | None = None
+
+
+def width(layout: Sequence[Term[Any]]) -> int:
+    """Inputs altogether."""
+    return sum(term.size for term in layout)
+
+
+def columns(layout: Sequence[Term[Any]]) -> dict[str, slice]:
+    """Where each term is in a row."""
+    ends = pairwise(accumulate((term.size for term in layout), initial=0))
+    return {term.name: slice(*place) for term, place in zip(layout, ends, strict=True)}
+
+
+def mirror(layout: Sequence[Term[Any]]) -> Flip:
+    """Of whole rows."""
+    source: list[int] = []
+    sign: list[float] = []
+    for term in layout:
+        flip = term.mirror or in_place(*(1.0,) * term.size)
+        assert len(flip.source) == len(flip.sign) == term.size, term.name
+        source += [len(sign) + i for i in flip.source]
+        sign += flip.sign
+    return Flip(tuple(source), tuple(sign))
+
+
+def observe(
+    layout: Sequence[Term[S]], source: S, noise: Noise | None = None
+) -> NDArray[np.float32]:
+    """Rows of M robots, (M, n), of a network's inputs; what is measured carries the ``noise``."""
+    parts = []
+    for term in layout:
+        value = term.read(source)
+        if noise is not None and term.noise is not None:
+            value = value + noise.draw(getattr(noise.config, term.noise), value.shape)
+        parts.append(term.scale * value)
+    return np.concatenate(parts, axis=1).astype(np.float32)

@@ -1,0 +1,179 @@
+"""Crossings: training episodes that lead over a tile, as the high policy will ask for.
+
+A robot that crosses is steered from platform to platform along a waypoint, facing where it goes or
+any other way; its pitch follows the slope, and over trenches most leap. Levels rise with crossings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.config import LowLevelConfig
+from tdgc.sim.commands import CONTINUOUS, INDEX
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.terrain import MAX_LEVEL, TILE_SIZE, TileField
+from tdgc.tasks.command_draw import PRONK
+from tdgc.tasks.episodes import Episodes
+from tdgc.tasks.ground import Ground
+from tdgc.tasks.leaps import SWING_HEIGHT, Landing, LeapPlan
+from tdgc.tasks.rules import GOAL_RADIUS
+from tdgc.tasks.tiles import FLAT
+
+Ints = NDArray[np.int64]
+_YAW_RATE, _PITCH = INDEX["yaw_rate"], INDEX["pitch"]
+_FREQUENCY, _LENGTH = INDEX["frequency"], INDEX["stance_length"]
+
+
+class Crossings:
+    """Steers M robots over their tiles.
+
+    Args:
+        config: the MDP.
+        families: of the robots' tiles, (M,) names; on flat ones nobody crosses.
+        episodes: of the robots, changed in place.
+        rng: what is drawn from.
+
+    Attributes:
+        flat: (M,) whose tiles are.
+        leapers: (M,) whose tiles have trenches.
+        landing: of the low policy as it is now, learned from its leaps.
+    """
+
+    def __init__(
+        self,
+        config: LowLevelConfig,
+        families: Sequence[str],
+        episodes: Episodes,
+        rng: np.random.Generator,
+    ) -> None:
+        self._config, self._episodes, self._rng = config.crossing, episodes, rng
+        self._levels = config.levels
+        self._low, self._high = np.array([getattr(config.commands, n) for n in CONTINUOUS]).T
+        self.flat = np.array([family == FLAT for family in families])
+        self.leapers = np.array([family == "gap" for family in families])
+        self._plan = LeapPlan(len(families), config.commands)
+        self.landing = Landing()
+
+    def look(self, field: TileField, index: NDArray[np.integer]) -> None:
+        """Plan the leaps of the robots ``index`` (n,) over the trenches of their tiles."""
+        for i in index[self.leapers[index]]:
+            trenches = field.features[int(i), 0].trenches
+            self._plan.look(int(i), trenches, self.landing.spread)
+
+    # ------------------------------------------------------------------ what is drawn
+
+    def begin(self, index: NDArray[np.integer], origin: Array, goal: Array) -> None:
+        """Draw who of the robots ``index`` (n,) crosses in its new episode.
+
+        Args:
+            index: whose episodes begin.
+            origin, goal: (n, 2) m in the world, of the tiles and on them.
+        """
+        e = self._episodes
+        e.origin[index], e.waypoint[index] = origin, goal
+        drawn = self._rng.uniform(size=len(index)) < self._config.share
+        e.crossing[index] = drawn & ~self.flat[index]
+
+    def narrow(
+        self, index: NDArray[np.integer], levels: Ints, gaits: Array, low: Array, high: Array
+    ) -> None:
+        """Narrow, in place, what commands of the robots ``index`` (n,) are drawn from, see
+        ``CommandDraw.bounds``, where they cross tiles of their ``levels`` (M,).
+
+        A foot that must clear a 15 cm step, or a trunk that bends away from a 0.4 rad slope, cannot
+        follow the rest and learns nothing from it.
+        """
+        c, crossing = self._config, self._episodes.crossing[index]
+        gaits[crossing] = c.gaits
+        gaits[crossing & self.leapers[index]] = c.trench_gaits
+        d = np.where(crossing, levels[index] / MAX_LEVEL, 0.0)
+        swing, height, bend = INDEX["swing_height"], INDEX["body_height"], [_PITCH, INDEX["roll"]]
+        clearance = c.clearance[0] + d * (c.clearance[1] - c.clearance[0])
+        low[:, swing] = np.minimum(low[:, swing] + crossing * clearance, high[:, swing])
+        low[:, height] *= 1.0 - d
+        low[:, bend] *= (1.0 - (1.0 - c.bend) * d)[:, None]
+        high[:, bend] *= (1.0 - (1.0 - c.bend) * d)[:, None]
+
+    def draw(self, index: NDArray[np.integer], gait: Ints, values: Array) -> None:
+        """Draw how the robots ``index`` (n,) cross with the gaits (n,) and continuous commands
+        (n, 12) drawn for them; the swing height of leaps is changed in place."""
+        n, rng, c, e = len(index), self._rng, self._config, self._episodes
+        leaps = e.crossing[index] & self.leapers[index] & (gait == PRONK)
+        swing = INDEX["swing_height"]
+        values[leaps, swing] = rng.uniform(self._low[swing], SWING_HEIGHT, int(leaps.sum()))
+        e.leaping[index] = leaps
+        e.follow[index] = np.where(leaps, 0.0, rng.uniform(size=n))
+        e.pitch[index] = values[:, _PITCH]
+        slow, fast = rng.uniform(*c.speed, n), rng.uniform(*c.leap_speed, n)
+        e.speed[index] = np.where(leaps, fast, slow)
+        anywhere = rng.uniform(-np.pi, np.pi, n)
+        ahead = leaps | (rng.uniform(size=n) < c.facing)
+        e.facing[index] = np.where(ahead, 0.0, anywhere)
+
+    # ------------------------------------------------------------------ step by step
+
+    def steer(self, loco: Locomotion, ground: Ground) -> None:
+        """Point the commands of those that cross at their waypoints; note who arrives."""
+        e, state, command = self._episodes, loco.world.state, loco.command
+        rows = np.flatnonzero(e.crossing)
+        if not rows.size:
+            return
+        offset = e.waypoint - state.position[:, :2]
+        e.reached |= e.crossing & (np.linalg.norm(offset, axis=1) < GOAL_RADIUS)
+        bearing = np.arctan2(offset[:, 1], offset[:, 0])
+        direction = bearing - state.yaw
+        velocity = e.speed[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+        over = np.abs(velocity) / self._high[:2]
+        velocity /= np.maximum(over.max(axis=1, keepdims=True), 1.0)
+        # A leap faces across the trenches, so that both feet of a pair land on one line.
+        heading = np.where(e.leaping, 0.0, bearing + e.facing)
+        turn = self._config.heading_gain * wrap_angle(heading - state.yaw)
+        pitch = e.pitch - e.follow * ground.slope()
+        command[rows, :2] = velocity[rows]
+        for j, wanted in ((_YAW_RATE, turn), (_PITCH, pitch)):
+            command[rows, j] = np.clip(wanted, self._low[j], self._high[j])[rows]
+        self._time_leaps(loco)
+
+    def _time_leaps(self, loco: Locomotion) -> None:
+        e, state = self._episodes, loco.world.state
+        rows = np.flatnonzero(e.leaping & (e.elapsed % self._config.leap_decimation == 0))
+        if rows.size:
+            frequency, length = self._plan.steps(
+                rows,
+                (state.position[:, 0] - e.origin[:, 0])[rows],
+                state.heading_vel[rows, 0],
+                loco.clock.clock[rows],
+                self.landing,
+            )
+            loco.command[rows, _FREQUENCY], loco.command[rows, _LENGTH] = frequency, length
+
+    def learn_landing(self, loco: Locomotion, clock: Array) -> None:
+        """Learn from the leaps of a step where feet land; ``clock`` (M,) is from before it."""
+        rows = np.flatnonzero(self._episodes.leaping)
+        self.landing.learn(loco, rows, clock[rows], self._config.landing_rate)
+
+    def move(
+        self, levels: Ints, x: Array, ended: NDArray[np.bool_], tried: NDArray[np.bool_]
+    ) -> Ints:
+        """Levels (M,) after a step, moved as legged_gym does.
+
+        Up when the tile was crossed; down when too little of it was; a robot that crosses the last
+        level starts over at a random one.
+
+        Args:
+            levels: (M,) before.
+            x: (M,) m, how far along their tiles the robots are.
+            ended: (M,) whose episodes end with this step.
+            tried: (M,) of these the ones that fell or had all of an episode's time.
+        """
+        e, c = self._episodes, self._config
+        crossed = ended & e.crossing & e.reached
+        short = tried & e.crossing & ~e.reached & (x < c.demotion * TILE_SIZE)
+        levels = levels + crossed - short
+        solved = levels >= self._levels
+        levels[solved] = self._rng.integers(0, self._levels, int(solved.sum()))
+        return np.maximum(levels, 0)

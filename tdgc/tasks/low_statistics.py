@@ -1,0 +1,66 @@
+"""Sums over the control steps of the low policy's training, and the log's values made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from tdgc.sim.commands import INDEX, gait_index
+from tdgc.sim.gaits import GAITS
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.tasks.rewards import CONTACT_FORCE
+
+
+class Sums(dict[str, float]):
+    """Numbers that are added up by name."""
+
+    def add(self, name: str, value: float) -> None:
+        """Add to one of them, which begins at 0."""
+        self[name] = self.get(name, 0.0) + float(value)
+
+
+def by_gait(loco: Locomotion, terms: Mapping[str, Array]) -> dict[str, Array]:
+    """Sums over the robots in each gait after a control step, (4,) each.
+
+    ``steps``: how many there are; ``lin`` and ``yaw``: squared errors of velocity, m^2/s^2, and yaw
+    rate, rad^2/s^2; ``match``: shares of feet in contact as desired; ``track_lin_vel`` and
+    ``track_yaw_rate``: of the reward ``terms``, 0 where one is switched off.
+    """
+    state, nothing = loco.world.state, np.zeros(loco.num_robots)
+    in_contact, wanted = state.foot_force > CONTACT_FORCE, loco.clock.contact > 0.5
+    samples = {
+        "steps": np.ones(loco.num_robots),
+        "lin": np.sum((state.heading_vel[:, :2] - loco.command[:, :2]) ** 2, axis=1),
+        "yaw": (state.ang_vel[:, 2] - loco.command[:, INDEX["yaw_rate"]]) ** 2,
+        "match": np.mean(in_contact == wanted, axis=1),
+        "track_lin_vel": terms.get("track_lin_vel", nothing),
+        "track_yaw_rate": terms.get("track_yaw_rate", nothing),
+    }
+    sums = np.stack(list(samples.values())) @ np.eye(len(GAITS))[gait_index(loco.command)]
+    return dict(zip(samples, sums, strict=True))
+
+
+def summarise(sums: Mapping[str, float]) -> dict[str, float]:
+    """Sums of ``LowLevelTask.take_stats`` over all workers -> values to log."""
+    steps = max(sums.get("steps", 0.0), 1.0)
+    values = {"reward/total": sums.get("reward", 0.0) / steps}
+    values["falls_per_minute"] = sums.get("falls", 0.0) / (sums.get("minutes", 0.0) or 1.0)
+    for key, value in sums.items():
+        kind, _, name = key.partition("/")
+        if kind == "term":
+            values[f"reward/{name}"] = value / steps
+        elif kind == "share":
+            values[f"command_share/{name}"] = value / sums["robots"]
+        elif kind == "landing":
+            values[key] = value / sums["leapers"]
+        elif kind == "level" and name.endswith("/level"):
+            family = name.removesuffix("/level")
+            values[f"level/{family}"] = value / max(sums[f"level/{family}/count"], 1.0)
+    for gait in GAITS:
+        n = max(sums.get(f"gait/{gait}/steps", 0.0), 1.0)
+        values[f"tracking/{gait}_velocity_rmse"] = (sums.get(f"gait/{gait}/lin", 0.0) / n) ** 0.5
+        values[f"tracking/{gait}_yaw_rate_rmse"] = (sums.get(f"gait/{gait}/yaw", 0.0) / n) ** 0.5
+        values[f"tracking/{gait}_contact_match"] = sums.get(f"gait/{gait}/match", 0.0) / n
+    return values

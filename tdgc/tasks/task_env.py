@@ -1,0 +1,56 @@
+"""One robot of a task as a Gymnasium environment; both MDPs have such a face."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+
+class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One robot of a task as a Gymnasium environment.
+
+    Args:
+        make_task: (seed, whether pictures are wanted) -> the task of one robot. A reset with a seed
+            makes it anew, so that all that follows is repeatable.
+        render_mode: None, or rgb_array for pictures of 640 x 400.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012  as in gymnasium
+
+    def __init__(self, make_task: Callable[[int, bool], Any], render_mode: str | None) -> None:
+        self.render_mode = render_mode
+        self._make_task = make_task
+        self.task = make_task(0, render_mode is not None)
+        self.action_space = self.task.action_space
+        self.observation_space = self.task.observation_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        super().reset(seed=seed)
+        if seed is not None:
+            self.task.close()
+            self.task = self._make_task(seed, self.render_mode is not None)
+        self.task.reset(np.arange(1))
+        return self.task.observe()[0], {}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        reward, terminated, truncated = self.task.step(np.asarray(action)[None])
+        info = {"is_success": bool(self.task.reached[0])}
+        obs = self.task.observe()[0]
+        return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        if self.render_mode is None:
+            return None
+        picture: NDArray[np.uint8] = self.task.locomotion.world.picture(0)
+        return picture
+
+    def close(self) -> None:
+        self.task.close()

@@ -1,0 +1,82 @@
+"""Commands drawn in training, and how their velocity ranges grow."""
+
+import dataclasses
+
+import numpy as np
+
+from tdgc.config import LowLevelConfig
+from tdgc.sim.commands import INDEX
+from tdgc.sim.robot import Array
+from tdgc.tasks.command_draw import CommandDraw
+
+CONFIG = LowLevelConfig()
+
+
+def make(training: bool, command_start: float = 0.4) -> CommandDraw:
+    config = dataclasses.replace(CONFIG, command_start=command_start)
+    return CommandDraw(config, np.random.default_rng(0), training)
+
+
+def drawn(draw: CommandDraw, n: int) -> tuple[Array, Array]:
+    """Gaits and values of n free commands."""
+    return draw.draw(*draw.bounds(n), np.ones(n, dtype=bool))
+
+
+def test_commands_fill_their_ranges() -> None:
+    gaits, values = drawn(make(training=False), 600)
+    bounds = np.array(dataclasses.astuple(CONFIG.commands))
+    width = bounds[:, 1] - bounds[:, 0]
+    assert (values >= bounds[:, 0]).all() and (values <= bounds[:, 1]).all()
+    assert (values.min(axis=0) < bounds[:, 0] + 0.05 * width).all()
+    assert (values.max(axis=0) > bounds[:, 1] - 0.05 * width).all()
+    standing = (values[:, :3] == 0.0).all(axis=1).mean()
+    assert 0.05 < standing < 0.16
+    # 0.2, 0.2, 0.3 and 0.3 of the 19 in 20 that do not leap; the others pronk. Three deviations.
+    np.testing.assert_allclose(np.bincount(gaits, minlength=4), [114, 144, 171, 171], atol=36)
+
+
+def test_leaps_are_fast_and_slow_in_step_and_free_commands_only() -> None:
+    config = dataclasses.replace(
+        CONFIG, command_draw=dataclasses.replace(CONFIG.command_draw, leaps=1.0, standing=0.0)
+    )
+    draw = CommandDraw(config, np.random.default_rng(0), training=False)
+    free = np.arange(200) < 100
+    gaits, values = draw.draw(*draw.bounds(200), free)
+    assert (gaits[free] == 1).all() and not (gaits[~free] == 1).all()
+    vx, frequency = values[:, INDEX["vx"]], values[:, INDEX["frequency"]]
+    assert (vx[free] >= 0.7).all() and vx[~free].min() < -0.5
+    assert (frequency[free] <= 2.75).all() and frequency[~free].max() > 3.5
+
+
+def test_training_begins_with_a_share_of_the_velocity_ranges() -> None:
+    draw = make(training=True, command_start=0.25)
+    assert draw.share.tolist() == [0.25] * 4
+    draw.share[2] = 1.0
+    gaits, values = drawn(draw, 400)
+    paces = gaits == 2
+    assert np.abs(values[~paces, 0]).max() <= 0.25 and np.abs(values[paces, 0]).max() > 0.7
+    assert np.abs(values[:, INDEX["body_height"]]).max() > 0.029  # others have their full range
+
+
+def test_velocity_ranges_grow_for_a_gait_that_does_well() -> None:
+    """Of 4 robots each gait is judged by 200 samples."""
+    draw, weights = make(training=True), CONFIG.rewards
+    samples = np.array([1000.0, 0.0, 10.0, 1000.0])
+    sums = {
+        "steps": samples,
+        "track_lin_vel": samples * weights.track_lin_vel * [1.0, 1.0, 1.0, 0.3],  # bound is slow
+        "track_yaw_rate": samples * weights.track_yaw_rate,
+        "match": samples,
+    }
+    draw.judge(sums, 4)
+    np.testing.assert_allclose(draw.share, [0.45, 0.4, 0.4, 0.4], atol=1e-12)
+    assert (draw.scores[[0, 3]] == 0.0).all() and draw.scores[2, 0] == 10
+    np.testing.assert_allclose(draw.grown(), [0.05 / 0.6, 0.0, 0.0, 0.0], atol=1e-12)
+    draw.share[0] = 0.98
+    draw.judge(sums, 4)
+    assert draw.share[0] == 1.0
+
+
+def test_velocity_ranges_are_whole_outside_training() -> None:
+    draw = make(training=False)
+    assert draw.share.tolist() == [1.0] * 4 and draw.grown().tolist() == [1.0] * 4
