@@ -129,7 +129,7 @@ class TeacherDriver:
 
 
 class HierarchyDriver:
-    """Drives robots by the recurrent high level (paper Sec. IV-B), ``tdgc``.
+    """Drives robots by the high level (paper Sec. IV-B), ``tdgc``; recurrent or feed-forward.
 
     A decision is deterministic and its commands are held for ``decimation`` control steps.
 
@@ -142,7 +142,7 @@ class HierarchyDriver:
         assert config.commands is not None  # filled in by ``load_high``
         self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
-        self._decoder = CommandDecoder(config.commands, config.action_limit)
+        self._decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         m, config = loco.num_robots, self.config
@@ -188,7 +188,7 @@ def load_high(
             message names the mismatch.
     """
     high = policies.load(path)
-    if high.kind != "lstm" or high.action_dim != NUM_ACTIONS:
+    if high.action_dim != NUM_ACTIONS:
         raise ConfigError(f"{path}: not a high-level policy of this package")
     try:
         config = recorded(HighLevelConfig, high.meta["config"], path)
