@@ -227,6 +227,8 @@ def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
         ConfigError: bounds that the low policy was not trained on; names the command and both.
     """
     ranges = high.commands or low.commands
+    if high.behaviour == "velocities":
+        ranges = at_default(ranges)
     for f in dataclasses.fields(low.commands):
         asked, trained = getattr(ranges, f.name), getattr(low.commands, f.name)
         if asked[0] < trained[0] or asked[1] > trained[1]:
@@ -234,8 +236,6 @@ def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
                 f"commands.{f.name} asks for {list(asked)}, but the low policy was trained on "
                 f"{list(trained)}"
             )
-    if high.behaviour == "velocities":
-        ranges = at_default(ranges)
     return dataclasses.replace(high, commands=ranges)
 
 
