@@ -101,8 +101,8 @@ def check(runner: Runner, chosen: Sequence[Variant]) -> None:
     """
     for variant in chosen:
         with_overrides(HighTrainConfig(), runner.training_settings(variant))
-        flags = runner.evaluation_flags(variant, runner.low, None)
-        evaluate.Evaluation.of(evaluate.parse([str(flag) for flag in flags]))
+    flags = runner.evaluation_flags("gp", runner.low, None)
+    evaluate.Evaluation.of(evaluate.parse([str(flag) for flag in flags]))
 
 
 def claim(runner: Runner) -> dict[str, Any]:

@@ -104,7 +104,7 @@ class Runner:
             low, high = changed_pair(cell.variant, self.low, high, folder)
         except (ValueError, OSError) as error:
             raise CellError(str(error)) from error
-        flags = self.evaluation_flags(cell.variant, low, high)
+        flags = self.evaluation_flags(cell.variant.policy, low, high)
         call(evaluate.main, [*flags, "--out", folder / "evaluation"])
         found = {"evaluate_seconds": round(time.monotonic() - began, 1)}
         if cell.variant.settings is not None:
@@ -119,11 +119,11 @@ class Runner:
         own = (variant.settings or ()) + (variant.alone if self.alone else ())
         return self.settings + own
 
-    def evaluation_flags(self, variant: Variant, low: Path, high: Path | None) -> list[object]:
+    def evaluation_flags(self, policy: str, low: Path, high: Path | None) -> list[object]:
         """The flags of evaluate.py: of all variants the same tiles."""
         env = with_overrides(HighTrainConfig(), self.settings).env
         flags: list[object] = [
-            *("--policies", variant.policy, "--levels", self.levels, "--episodes", self.episodes),
+            *("--policies", policy, "--levels", self.levels, "--episodes", self.episodes),
             *("--families", ",".join(dict.fromkeys(env.families))),
             *("--low", low, "--workers", self.workers),
         ]
