@@ -21,11 +21,11 @@ import torch as th
 from tqdm import tqdm
 
 from tdgc import __version__, policies
-from tdgc.config import PRESETS, ConfigError, HighTrainConfig, to_dict
+from tdgc.config import NO_TEACHER, PRESETS, ConfigError, HighTrainConfig, to_dict
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy
 from tdgc.learn.ppo import LinearRate, shared_keywords
-from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
@@ -71,9 +71,11 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
     Its exploration then stumbles on goals from the first episodes; around the middle of the bounds
     it would stand still in a random gait.
     """
-    command = default_command()
+    decoder = CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
+    command = decoder.nearest(default_command())
     command[INDEX["vx"]] = config.start_speed
-    decoder = CommandDecoder(config.env.commands, config.env.action_limit)
+    if config.env.behaviour == "all":
+        command[INDEX["swing_height"]] = config.start_swing
     with th.no_grad():
         head = policy.action_net
         bias = (head.linear if isinstance(head, MirroredHead) else head).get_parameter("bias")
@@ -126,10 +128,12 @@ def make_learner(
         env,
         policy_kwargs={
             "lstm_hidden_size": ppo.lstm,
+            "gait": GaitNoise(config.n_envs, len(config.env.gaits), ppo.gait_hold),
             "net_arch": {"pi": list(ppo.actor), "vf": list(ppo.critic)},
             "log_std_init": math.log(ppo.initial_std),
             "mirror": high_mirror(config.env) if ppo.mirror else None,
         },
+        gait_ent_coef=ppo.gait_ent_coef,
         seed=config.seed,
         device=device,
         **keywords,
@@ -173,6 +177,25 @@ def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
     ]
 
 
+def check(config: HighTrainConfig) -> None:
+    """Refuse settings that would fail later, or do nothing.
+
+    Raises:
+        ValueError: says which one, and what is allowed.
+    """
+    unknown, ppo = config.env.unknown_share, config.ppo
+    if not 0.0 <= unknown <= 1.0:
+        raise ConfigError(f"'env.unknown_share' must be from 0 to 1, not {unknown:g}")
+    if ppo.gait_hold < 1:
+        raise ConfigError(f"'ppo.gait_hold' must be at least 1, not {ppo.gait_hold}")
+    if ppo.gait_ent_coef < 0.0 or (ppo.gait_ent_coef > 0.0 and not ppo.ent_coef > 0.0):
+        raise ConfigError(
+            f"'ppo.gait_ent_coef' must be at least 0, and 0 without an ent_coef, not "
+            f"{ppo.gait_ent_coef:g}"
+        )
+    CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     add_arguments(parser, "runs/high")
@@ -182,8 +205,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--preset", choices=PRESETS, default="default", help="paper: the paper's hyperparameters"
     )
+    parser.add_argument(
+        "--no-teacher", action="store_true", help="reinforcement learning alone, on any terrain"
+    )
     args = parser.parse_args(arguments)
-    args.assignments[:0] = PRESETS[args.preset]
+    args.assignments[:0] = PRESETS[args.preset] + (NO_TEACHER if args.no_teacher else ())
     if args.init is not None and not args.resume:
         args.assignments.insert(0, "imitation.steps=0")  # it would unlearn what it begins with
     if args.low is not None:
@@ -196,9 +222,7 @@ def main(arguments: list[str] | None = None) -> int:
         check_robot(low_config.robot, low_config.physics)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check_families(config.env.families)
-        unknown = config.env.unknown_share
-        if not 0.0 <= unknown <= 1.0:
-            raise ConfigError(f"'env.unknown_share' must be from 0 to 1, not {unknown:g}")
+        check(config)
         if config.imitation.steps:
             for family in config.env.families:
                 if family not in STYLES:

@@ -281,8 +281,10 @@ class HighRewardConfig:
     """Weights and constants of the high-level reward (Sec. IV-B), one weight per term.
 
     Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the step's
-    duration.
+    duration, unless ``step_time_scaling`` is off: then they are per decision.
     """
+
+    step_time_scaling: bool = field(default=True, metadata={"before": True})
 
     goal_distance: float = 1.0
     face: float = 0.2
@@ -306,12 +308,22 @@ class HighRewardConfig:
     lazy_speed: float = 0.1  # m/s, v_th
 
 
+_GAITS: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = ("trot", "pronk", "pace", "bound")
+
+
 @dataclass(frozen=True)
 class HighLevelConfig:
     """The decision-level MDP (Sec. IV-B) and its curriculum (Sec. IV-C)."""
 
     decimation: int = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
     cues: Literal["both", "semantic", "geometric", "none"] = "both"
+    # Gaits that the gait channel chooses from, in equal shares of its range.
+    gaits: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = field(
+        default=_GAITS, metadata={"before": _GAITS}
+    )
+    # What it decides: all commands, or the velocities and the gait. The other commands then stay at
+    # their defaults, or as near as ``commands`` lets them.
+    behaviour: Literal["all", "velocities"] = field(default="all", metadata={"before": "all"})
     # Where the heights of the geometric cue are probed, see ``tdgc.tasks.probes``.
     probes: Literal["lines", "staggered"] = field(default="lines", metadata={"before": "staggered"})
     # Share of the robots in training that are told an unknown family, so that the probes alone have
@@ -319,6 +331,14 @@ class HighLevelConfig:
     unknown_share: float = 0.2
     families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "tilt")
     levels: int = 11  # L_max: levels 0..10
+    # How levels are chosen in training: by each robot's performance, as the paper has it; drawn
+    # uniformly for each episode; or always the hardest.
+    curriculum: Literal["performance", "uniform", "hardest"] = field(
+        default="performance", metadata={"before": "performance"}
+    )
+    # m: in training trenches are this deep on level 0 and deepen from there, see
+    # ``tdgc.tasks.tiles.shallow``; null: all of them are as deep as in the benchmark.
+    shallowest_trench: float | None = field(default=None, metadata={"before": None})
     window: int = 4  # W episodes: short, since an episode of every robot takes minutes on two cores
     threshold: int = 3  # S successes of them
     first_levels: int = 1  # robots begin spread over levels 0..first_levels-1
@@ -407,8 +427,14 @@ class RecurrentPPOConfig:
     initial_std: float = 0.1
     # of the gait channel: a gait is 0.5 wide, so that noise changes it once in a thousand decisions
     initial_gait_std: float = 0.08
-    # With 128 units each an update takes twice as long, and what is learned is no better.
-    lstm: int = 64
+    # Decisions that the noise of the gait channel is held for, within an episode: what a gait is
+    # worth shows in a second, not in a tenth of one.
+    gait_hold: int = field(default=1, metadata={"before": 1})
+    # Bonus on the entropy of the gait alone, which falls linearly to nothing at the last step.
+    gait_ent_coef: float = field(default=0.0, metadata={"before": 0.0})
+    # Units of both LSTMs; null for a feed-forward policy. With 128 units each an update takes twice
+    # as long, and what is learned is no better.
+    lstm: int | None = 64
     mirror: bool = True  # policy and value exactly left-right symmetric
     actor: tuple[int, ...] = (64,)
     critic: tuple[int, ...] = (64,)
@@ -434,6 +460,8 @@ class HighTrainConfig:
     log_steps: int = 24_000
     checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
     start_speed: float = 0.5  # m/s: before any training it walks straight on in the default gait
+    # m, of its feet then; 0.08 is the default of Walk These Ways.
+    start_swing: float = field(default=0.08, metadata={"before": 0.08})
     # The low policy: by default what train_low.py left in runs/low, or else the shipped one.
     low: str | None = None
     env: HighLevelConfig = field(default_factory=HighLevelConfig)
@@ -469,6 +497,28 @@ PRESETS: dict[str, tuple[str, ...]] = {
         "env.unknown_share=0",
     ),
 }
+
+#: ``train_high.py --no-teacher``: what reinforcement learning alone needs. Its noise has to find
+#: what the teacher would have shown.
+NO_TEACHER: tuple[str, ...] = (
+    "imitation.steps=0",
+    "ppo.initial_std=0.3",
+    "ppo.initial_gait_std=0.4",
+    "ppo.learning_rate=5e-4",
+    "env.unknown_share=0",
+    # With feet at 0.08 m it reached 67 % of the goals on Stair, with feet as high as gp's 98.5 %.
+    "start_swing=0.19",
+    # Standing at the start must not pay. With distances as shares of the tile's 8 m it is worth
+    # more than walking on once 0.086 falls a second are to be expected, and the untrained policy
+    # has 0.08; as shares of the distance between start and goal, from 0.24 on.
+    "env.rewards.map_radius=6.5",
+    # A trench of 60 cm ends whatever is tried at it.
+    "env.shallowest_trench=0.05",
+    # A second of a gait shows what it is worth. A bonus of the size that PPO takes for discrete
+    # actions keeps the gaits that easy levels do not need until hard ones do.
+    "ppo.gait_hold=10",
+    "ppo.gait_ent_coef=0.01",
+)
 
 
 Config = TypeVar("Config")

@@ -312,10 +312,10 @@ class HighLevel(nn.Module):
         layout = high_layout(config.cues)
         self.row = Row(layout)
         hidden = self.lstm[1].shape[1]
-        decoder = CommandDecoder(config.commands, config.action_limit)
+        decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
         self.low = _constant(decoder.low[:12])
         self.span = _constant(decoder.high[:12] - decoder.low[:12])
-        self.embedding = _constant(GAIT_TABLE)
+        self.embedding = _constant(GAIT_TABLE[decoder.gaits])
         self.limit = _constant(config.action_limit)
         self.nominal = _constant(nominal_pose(low.robot))
         step = config.decimation * low.physics.control_dt
@@ -377,7 +377,8 @@ class HighLevel(nn.Module):
     def _decode(self, decision: Tensor) -> Tensor:
         """As ``CommandDecoder.decode``: (13,) -> (15,)."""
         x = self._normalise(decision)
-        gait = (2.0 * (x[-1] + 1.0)).floor().clamp(0, len(GAITS) - 1).long()
+        n = len(self.embedding)
+        gait = (0.5 * n * (x[-1] + 1.0)).floor().clamp(0, n - 1).long()
         return th.cat([self.low + 0.5 * (x[:-1] + 1.0) * self.span, self.embedding[gait]])
 
 
@@ -411,7 +412,10 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
         raise ConfigError(
             f"{low}: its configuration gives {size} observations, it takes {low_policy.actor_dim}"
         )
-    return Pair(low_policy, low_config, *load_high(high, low_policy, low_config))
+    high_policy, high_config = load_high(high, low_policy, low_config)
+    if high_policy.kind != "lstm":
+        raise ConfigError(f"{high}: only a recurrent high policy can be exported")
+    return Pair(low_policy, low_config, high_policy, high_config)
 
 
 def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, dict[str, Any]]:

@@ -23,10 +23,10 @@ CHANNELS = [
     ("vx", "m/s", -1.0, 0.0, 1.0),
     ("vy", "m/s", -0.6, 0.0, 0.6),
     ("yaw_rate", "rad/s", -1.0, 0.0, 1.0),
-    ("body_height", "m", -0.03, 0.0, 0.03),
+    ("body_height", "m", -0.03, 0.01, 0.05),
     ("frequency", "Hz", 2.0, 3.0, 4.0),
     ("duration", "1", 0.4, 0.5, 0.6),
-    ("swing_height", "m", 0.03, 0.115, 0.20),
+    ("swing_height", "m", 0.03, 0.135, 0.24),
     ("pitch", "rad", -0.3, 0.0, 0.3),
     ("roll", "rad", -0.2, 0.0, 0.2),
     ("stance_width", "m", 0.20, 0.275, 0.35),
@@ -74,6 +74,47 @@ def test_encode_refuses_what_no_action_gives() -> None:
     command[INDEX["vx"]] = 1.2
     with pytest.raises(ValueError, match=r"^vx 1.2 is outside \[-1.0, 1.0\]$"):
         CommandDecoder().encode(command)
+
+
+def test_a_fixed_set_of_gaits_shares_the_channel() -> None:
+    decoder = CommandDecoder(action_limit=2.0, gaits=("pace", "trot", "bound"))
+    actions = np.zeros((5, 13))
+    actions[:, -1] = [-2.0, -0.7, -0.6, 0.7, 2.0]  # thirds of [-2, 2]
+    assert decoder.gait(actions).tolist() == [2, 2, 0, 3, 3]
+    commands = decoder.decode(actions)
+    assert gait_index(commands).tolist() == [2, 2, 0, 3, 3]
+    middles = decoder.encode(commands)[:, -1]
+    np.testing.assert_allclose(middles, [-4 / 3, -4 / 3, 0.0, 4 / 3, 4 / 3], atol=1e-15)
+    alone = CommandDecoder(gaits=("bound",))
+    assert (alone.gait(actions) == 3).all() and alone.encode(commands[4])[-1] == 0.0
+    with pytest.raises(ValueError, match=r"^gait pace is none of bound$"):
+        alone.encode(commands)
+
+
+@pytest.mark.parametrize("gaits", [(), ("trot", "trot"), ("trot", "gallop")])
+def test_gaits_that_are_none(gaits: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match=r"^gaits must be some of trot, pronk, pace, bound, each"):
+        CommandDecoder(gaits=gaits)
+
+
+def test_the_nearest_command_that_can_be_decoded() -> None:
+    ranges = CommandRanges(vx=(-0.5, 0.8), frequency=(3.0, 3.0))
+    decoder = CommandDecoder(ranges, gaits=("pace", "trot"))
+    commands = np.tile(default_command(), (3, 1))
+    commands[:, INDEX["vx"]] = [0.9, -0.7, 0.3]
+    commands[:, INDEX["frequency"]] = 2.5
+    commands[:, 12:] = gait_embedding([1, 0, 2])
+    near = decoder.nearest(commands)
+    assert near[:, INDEX["vx"]].tolist() == [0.8, -0.5, 0.3]
+    assert (near[:, INDEX["frequency"]] == 3.0).all()
+    assert gait_index(near).tolist() == [2, 0, 2]
+    same = [j for j in range(12) if j not in (INDEX["vx"], INDEX["frequency"])]
+    assert (near[:, same] == commands[:, same]).all()
+    actions = decoder.encode(near)  # in the middle where all actions mean the same
+    assert (actions[:, INDEX["frequency"]] == 0.0).all()
+    np.testing.assert_allclose(decoder.decode(actions), near, atol=1e-12)
+    inside = CommandDecoder().decode(np.random.default_rng(0).uniform(-1.0, 1.0, (9, 13)))
+    assert np.array_equal(CommandDecoder().nearest(inside), inside)
 
 
 @pytest.mark.parametrize("channel", range(12))

@@ -59,6 +59,7 @@ def save_high(
     config: HighLevelConfig = CONFIG,
     size: int | None = None,
     meta: dict[str, Any] | None = None,
+    hidden: int | None = 8,
 ) -> Path:
     """A small high level with random weights that walks about: gaits and commands vary."""
     size = size or width(high_layout(config.cues))
@@ -66,7 +67,7 @@ def save_high(
         spaces.Box(-np.inf, np.inf, (size,)),
         spaces.Box(-config.action_limit, config.action_limit, (NUM_ACTIONS,)),
         lambda _: 0.0,
-        lstm_hidden_size=8,
+        lstm_hidden_size=hidden,
         net_arch={"pi": [8], "vf": [8]},
     )
     generator = th.Generator().manual_seed(3)
@@ -77,7 +78,8 @@ def save_high(
             if parameter.dim() == 2:
                 noise = th.randn(parameter.shape, generator=generator)
                 parameter.copy_(noise / parameter.shape[-1] ** 0.5)
-        policy.lstm_actor.weight_ih_l0.mul_(8.0)  # quick to change its mind
+        if hidden is not None:
+            policy.lstm_actor.weight_ih_l0.mul_(8.0)  # quick to change its mind
         policy.action_net.weight[:-1].mul_(0.5)
         policy.action_net.weight[-1].mul_(2.0)  # the gait
         policy.action_net.bias.copy_(th.from_numpy(CommandDecoder().encode(walk)))
@@ -143,11 +145,13 @@ def test_the_teacher_drives_as_it_teaches(low, family):
         task.close()
 
 
-def test_hierarchy_decides_in_the_evaluation_as_in_its_environment(low, tmp_path):
+@pytest.mark.parametrize("hidden", [8, None], ids=["recurrent", "feed-forward"])
+def test_hierarchy_decides_in_the_evaluation_as_in_its_environment(low, tmp_path, hidden):
     """Observation, LSTM state, last action and clock of the environment, decision by decision."""
-    config = dataclasses.replace(CONFIG, families=("gap",))
-    high, loaded = load_high(save_high(tmp_path / "high", low, config), *low)
-    assert loaded == config
+    gaits = ("trot", "pace", "bound") if hidden is None else CONFIG.gaits
+    config = dataclasses.replace(CONFIG, families=("gap",), gaits=gaits)
+    high, loaded = load_high(save_high(tmp_path / "high", low, config, hidden=hidden), *low)
+    assert loaded == config and high.kind == ("mlp" if hidden is None else "lstm")
     task = NavigationTask(config, LOW, 2, seed=1, training=False)
     try:
         task.reset(np.arange(2))

@@ -47,14 +47,14 @@ def shake(policy: ActorCriticPolicy) -> None:
 
 
 def random_high(
-    path: Path, config: HighLevelConfig, low: LowLevelConfig = LOW_CONFIG, hidden: int = 32
+    path: Path, config: HighLevelConfig, low: LowLevelConfig = LOW_CONFIG, hidden: int | None = 32
 ) -> Path:
     """A high level with random weights, saved as ``train_high.py`` saves one."""
     size = width(high_layout(config.cues))
     limit = config.action_limit
     policy = FastRecurrentPolicy(
         unbounded(size), spaces.Box(-limit, limit, (13,)), lambda _: 1e-3,
-        lstm_hidden_size=hidden, net_arch={"pi": [hidden], "vf": [4]},
+        lstm_hidden_size=hidden, net_arch={"pi": [hidden or 8], "vf": [4]},
     )  # fmt: skip
     shake(policy)
     trained_on = {"config": to_dict(low), "observation": LOW_POLICY.actor_dim}
@@ -256,6 +256,16 @@ def test_decoding_is_the_decoders_to_the_last_bit_of_a_gait(high: Path) -> None:
         assert np.array_equal(got[12:], decoder.decode(action)[12:])
 
 
+def test_a_fixed_set_of_gaits_is_decoded_as_the_decoder_does(tmp_path: Path) -> None:
+    config = dataclasses.replace(HIGH_CONFIG, gaits=("pace", "trot", "bound"))
+    level = HighLevel(policies.load(random_high(tmp_path / "high", config)), config, LOW_CONFIG)
+    actions = np.random.default_rng(0).uniform(-1.2, 1.2, (50, 13))
+    wanted = CommandDecoder(config.commands, gaits=config.gaits).decode(actions)
+    found = [level._decode(th.from_numpy(action)).numpy() for action in actions]
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    assert len(np.unique(wanted[:, 12:], axis=0)) == 3
+
+
 def test_clock_signal_is_the_phase_clocks() -> None:
     rng = np.random.default_rng(4)
     commands = random_commands(rng, 200)
@@ -423,6 +433,7 @@ def save_pairs(path: Path) -> None:
     physics = dataclasses.replace(LOW_CONFIG.physics, control_dt=0.01)
     random_high(path / "high", HIGH_CONFIG, hidden=4)
     random_high(path / "fast", HighLevelConfig(commands=fast), hidden=4)
+    random_high(path / "forward", HIGH_CONFIG, hidden=None)
     random_high(
         path / "slow", HIGH_CONFIG, dataclasses.replace(LOW_CONFIG, physics=physics), hidden=4
     )
@@ -449,6 +460,7 @@ def save_pairs(path: Path) -> None:
         ("--high {0}/slow", "trained for a low level with a control step of 0.01 s, not 0.02"),
         ("--high {0}/blind", "trained for a high level that observes 48 values, not 86"),
         ("--high {0}/high --low {0}/dizzy", "dizzy: its configuration gives "),
+        ("--high {0}/forward", "forward: only a recurrent high policy can be exported"),
         ("--high {0}/high --out {0}/file/out", "Not a directory"),
     ],
 )

@@ -11,8 +11,17 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import tdgc  # noqa: F401  registers the environments
-from tdgc.config import ConfigError, HighLevelConfig, HighRewardConfig, RobotConfig
-from tdgc.sim.commands import NAMES
+from tdgc.config import (
+    NO_TEACHER,
+    CommandRanges,
+    ConfigError,
+    HighLevelConfig,
+    HighRewardConfig,
+    HighTrainConfig,
+    RobotConfig,
+    with_overrides,
+)
+from tdgc.sim.commands import NAMES, CommandDecoder, default_command, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import JOINTS, columns, width
 from tdgc.sim.robot import nominal_pose
@@ -121,6 +130,41 @@ def test_weights_are_scaled_by_the_steps_duration():
     assert terms["laziness"][0] == pytest.approx(0.1 * HighRewardConfig().laziness)
     off = step_of(config=dataclasses.replace(HighRewardConfig(), face=0.0))
     assert "face" not in rewards.high_terms(off, dt=0.1)
+
+
+def test_without_step_time_scaling_weights_are_per_decision():
+    config = dataclasses.replace(HighRewardConfig(), step_time_scaling=False)
+    for dt in (0.02, 0.1):
+        terms = rewards.high_terms(step_of(config=config), dt)
+        assert terms["alive"][0] == 0.1 and terms["laziness"][0] == -0.5
+
+
+def worth(rewards_config: HighRewardConfig, falls: float) -> tuple[float, float]:
+    """What marking time at the start is worth, and walking on at 0.5 m/s to 0.7 m from the goal
+    and marking time there, while ``falls`` robots a second fall and then get nothing."""
+
+    def each(distance: float) -> float:
+        seen = step_of(
+            distance=np.array([distance]), lin_vel=np.full((1, 3), 0.3), config=rewards_config
+        )
+        return float(sum(term[0] for term in rewards.high_terms(seen, 0.1).values()))
+
+    gamma, start, near, decisions = 0.99, 6.5, 0.7, 116
+    survive = gamma * np.exp(-0.1 * falls)
+    walk = sum(survive**k * each(start - 0.05 * k) for k in range(decisions))
+    there = survive**decisions * each(near) / (1.0 - gamma)
+    return each(start) / (1.0 - gamma), walk + there
+
+
+def test_without_a_teacher_standing_at_the_start_does_not_pay():
+    """The untrained policy falls 0.08 times a second on level 0: by default it may as well stay."""
+    stay, walk = worth(HighRewardConfig(), 0.08)
+    assert stay == pytest.approx(9.18, abs=0.01) and walk == pytest.approx(9.56, abs=0.05)
+    assert worth(HighRewardConfig(), 0.1)[1] < stay
+    alone = with_overrides(HighTrainConfig(), NO_TEACHER).env.rewards
+    stay, walk = worth(alone, 0.08)
+    assert stay == pytest.approx(3.0) and walk > 2.5 * stay
+    assert worth(alone, 0.2)[1] > stay
 
 
 def test_layout_and_cues():
@@ -296,6 +340,74 @@ def test_curriculum_moves_levels_and_redraws_tiles():
         assert task.curriculum.levels.tolist() == [1, 0]
         rises = [task.field.features[k, 0].risers[0, 1] for k in range(2)]
         assert rises == pytest.approx([0.042, 0.03])  # d = 0.1 and d = 0
+    finally:
+        task.close()
+
+
+@pytest.mark.parametrize("rule", ["uniform", "hardest"])
+def test_levels_without_performance(rule):
+    """Drawn for each episode, or the last; outcomes do not matter."""
+    config = dataclasses.replace(
+        CONFIG, families=("tilt",), curriculum=rule, levels=4, window=2, threshold=2
+    )
+    task = NavigationTask(config, LOW, 30, seed=0)
+    try:
+        met = []
+        for _ in range(6):
+            task.reset(np.arange(30))
+            met.append(task.curriculum.levels.copy())
+            assert np.array_equal(task.tiles.level, met[-1])
+            task.goal[:] = task.locomotion.world.state.position[:, :2]
+            task.elapsed[:] = task.horizon - 1
+            task.step(np.zeros((30, 13)))
+            assert task.reached.all() and np.array_equal(task.curriculum.levels, met[-1])
+        counts = np.bincount(np.concatenate(met), minlength=4)
+        if rule == "hardest":
+            assert counts.tolist() == [0, 0, 0, 180]
+        else:
+            assert counts.sum() == 180 and (counts > 25).all() and (counts < 70).all()
+    finally:
+        task.close()
+
+
+def test_trenches_are_shallow_in_training_alone_and_where_it_is_asked_for():
+    depths = []
+    for asked, training in ((0.05, True), (0.05, False), (None, True)):
+        config = dataclasses.replace(CONFIG, families=("gap",), shallowest_trench=asked)
+        task = NavigationTask(config, LOW, 1, seed=0, training=training)
+        depths.append(-task.field.heights.min())
+        task.close()
+    assert depths == pytest.approx([0.05, 0.6, 0.6], abs=1e-6)
+
+
+def test_velocities_alone_leave_the_other_commands_at_their_defaults():
+    _, low = load_low(LOW)
+    config = paired(HighLevelConfig(behaviour="velocities"), low)
+    decoder = CommandDecoder(config.commands)
+    rng, default = np.random.default_rng(0), default_command()
+    commands = decoder.decode(rng.uniform(-1.0, 1.0, (50, 13)))
+    assert (commands[:, 3:12] == default[3:12]).all()
+    assert (np.ptp(commands[:, :3], axis=0) > 1.0).all()
+    assert paired(config, low) == config  # as it is read from a policy's file
+    high = CommandRanges(swing_height=(0.19, 0.19))
+    config = paired(HighLevelConfig(behaviour="velocities", commands=high), low)
+    assert config.commands.swing_height == (0.19, 0.19)
+    assert config.commands.body_height == (0.0, 0.0)  # within the low policy's bounds
+
+
+def test_a_teacher_says_what_can_be_said_of_what_it_does():
+    """Over trenches it pronks; who may only trot at fixed parameters is shown how fast and where
+    to."""
+    config = dataclasses.replace(CONFIG, families=("gap",), gaits=("trot",), behaviour="velocities")
+    task = NavigationTask(config, LOW, 2, seed=0, guided=8)
+    try:
+        task.reset(np.arange(2))
+        size = task.actor_dim
+        taught = task.decoder.decode(task.observe()[:, size:].astype(float))
+        wanted = task.teacher.commands(task.locomotion, task.goal)
+        assert (gait_index(wanted) == 1).all() and (gait_index(taught) == 0).all()
+        np.testing.assert_allclose(taught[:, :3], wanted[:, :3], atol=1e-6)
+        np.testing.assert_allclose(taught[:, 3:12], np.tile(default_command()[3:12], (2, 1)))
     finally:
         task.close()
 

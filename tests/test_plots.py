@@ -162,3 +162,24 @@ def test_decision_figure_marks_the_end_of_imitation(tmp_path: Path) -> None:
         return share_of(picture(tmp_path / "training.png"), "#808080")
 
     assert grey({**taught, "train/imitation_loss": 1.0}) > grey(taught) + 2e-4
+
+
+def test_ablation_figure_has_a_bar_per_variant_as_long_as_its_rate(tmp_path: Path) -> None:
+    """Half of the goals, all of them, and one that is still to come."""
+    rows: list[dict[str, object]] = [
+        {"name": "full", "what": "all", "n": 50, "rate": 0.5, "ci_low": 0.37, "ci_high": 0.63,
+         "seeds": {"1": 0.4, "2": 0.6}},
+        {"name": "trot", "what": "one", "n": 25, "rate": 1.0, "ci_low": 0.87, "ci_high": 1.0,
+         "seeds": {"1": 1.0}},
+        {"name": "gp", "what": "script", "errors": {}},
+    ]  # fmt: skip
+    shares = []
+    for some in (rows[:1], rows[1:2], rows):
+        (tmp_path / "ablation.json").write_text(json.dumps({"rows": some}))
+        plots.ablation(tmp_path / "ablation.json", tmp_path / "ablation.png")
+        pixels = matplotlib.image.imread(tmp_path / "ablation.png")[..., :3]
+        bar = np.abs(pixels - np.array([0.4, 0.668, 0.82])) < 0.02  # tdgc's blue, 0.6 of it
+        widest = bar.all(axis=-1).sum(axis=1)
+        shares.append(widest.max() / pixels.shape[1])
+        assert len(pixels) == 120 * (1.0 + 0.3 * len([row for row in some if "n" in row]))
+    assert shares[0] < 0.65 * shares[1] and shares[2] > 0.5

@@ -10,8 +10,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from tdgc import policies
-from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.learn.recurrent import (
+    FastRecurrentPolicy,
+    FastRecurrentPPO,
+    GaitNoise,
+    gait_entropy,
+)
 from tdgc.policies import Mirror
+from tdgc.sim.commands import CommandDecoder
 
 OBS, ACT, HIDDEN = 6, 2, 16
 ENVS, STEPS = 5, 12
@@ -268,3 +274,131 @@ def test_a_mirrored_policy_acts_from_its_file_as_it_was_trained(tmp_path):
     assert state[0].shape == (1, ENVS, 2 * HIDDEN)
     with pytest.raises(ValueError, match=rf"it must be two of \(1, 5, {2 * HIDDEN}\)"):
         loaded.predict(seen[0], (np.zeros((1, 5, HIDDEN)),) * 2)
+
+
+# ------------------------------------------------------------------ no memory
+
+FORWARD = {"lstm_hidden_size": None}
+
+
+@pytest.mark.parametrize("mirror", [None, MIRROR], ids=["plain", "mirrored"])
+def test_a_feed_forward_policy_remembers_nothing_and_learns(mirror, tmp_path):
+    rng = np.random.default_rng(2)
+    seen = rng.normal(size=(STEPS, ENVS, OBS)).astype(np.float32)
+    starts = np.zeros((STEPS, ENVS), dtype=np.float32)
+    model = make_model(FastRecurrentPolicy, policy_kwargs={**FORWARD, "mirror": mirror})
+    sizes = {name: tuple(p.shape) for name, p in model.policy.named_parameters()}
+    assert not [name for name in sizes if "lstm" in name]
+    held = {p for group in model.policy.optimizer.param_groups for p in group["params"]}
+    assert held == set(model.policy.parameters())
+    before = [p.clone() for p in model.policy.parameters()]
+    model.learn(3 * ENVS * STEPS)
+    assert all((a != b).any() for a, b in zip(model.policy.parameters(), before, strict=True))
+    actions, values = run_through(model.policy, seen, starts)
+    backwards, same = run_through(model.policy, seen[::-1].copy(), starts)
+    th.testing.assert_close(backwards.flip(0), actions)
+    th.testing.assert_close(same.flip(0), values)
+    assert actions.std() > 1e-2
+    policies.save(tmp_path / "policy", model.policy, {})
+    loaded = policies.load(tmp_path / "policy")
+    assert (loaded.kind, loaded.header.lstm, loaded.header.actor) == ("mlp", None, (8,))
+    given, state = loaded.predict(seen[0])
+    np.testing.assert_allclose(given, actions[0].clamp(-2.0, 2.0), atol=1e-6)
+    assert state is None
+    other = make_model(FastRecurrentPolicy, policy_kwargs={**FORWARD, "mirror": mirror}).policy
+    policies.load_into(tmp_path / "policy", other)
+    th.testing.assert_close(run_through(other, seen, starts)[0], actions)
+
+
+def test_a_feed_forward_rollout_is_evaluated_as_it_was_collected():
+    model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=FORWARD)
+    model.learn(2 * ENVS * STEPS)
+    for batch in model.rollout_buffer.get(24):
+        values, log_prob, _ = model.policy.evaluate_actions(
+            batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
+        )
+        assert (values.flatten() - batch.old_values).abs().max() < 2e-6
+        assert (log_prob - batch.old_log_prob).abs().max() < 1e-5
+
+
+# ------------------------------------------------------------------ exploring gaits
+
+
+def test_noise_of_the_gait_is_held_within_an_episode():
+    """Of a policy whose mean action is always 0, so that its actions are the noise."""
+    gait = {"gait": GaitNoise(ENVS, 4, hold=5)}
+    model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=gait)
+    with th.no_grad():
+        model.policy.action_net.weight.zero_()
+    model.learn(ENVS * STEPS)
+    first = model.rollout_buffer.actions.copy()
+    model.learn(ENVS * STEPS, reset_num_timesteps=False)
+    buffer = model.rollout_buffer
+    actions = np.concatenate([first, buffer.actions])
+    assert (np.diff(actions[:, :, 0], axis=0) != 0.0).all()
+    changed = np.diff(buffer.actions[:, :, -1], axis=0) != 0.0
+    starts = buffer.episode_starts[1:] > 0.0
+    assert starts.any() and changed[starts].all()
+    for env in range(ENVS):  # runs of one value: no longer than five, and five where none starts
+        ends = np.flatnonzero(changed[:, env])
+        runs = np.diff(ends)
+        whole = ~starts[ends[1:], env]
+        assert (runs <= 5).all() and (runs[whole] == 5).all()
+    batch = next(buffer.get(ENVS * STEPS))
+    _, log_prob, _ = model.policy.evaluate_actions(
+        batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
+    )
+    assert (log_prob - batch.old_log_prob).abs().max() < 1e-5
+    assert model.policy.state_dict()["held"].shape == (2, ENVS)
+    assert len(np.unique(actions[:, :, -1])) < 0.4 * 2 * ENVS * STEPS
+
+
+def test_noise_that_is_not_held_is_the_stock_policys():
+    drawn = []
+    for kwargs in ({}, {"gait": GaitNoise(ENVS, 4)}):
+        model = make_model(FastRecurrentPolicy, policy_kwargs=kwargs)
+        model.learn(ENVS * STEPS)
+        drawn.append(model.rollout_buffer.actions)
+        assert "held" not in model.policy.state_dict()
+    assert np.array_equal(*drawn)
+
+
+@pytest.mark.parametrize(("mean", "std"), [(-1.5, 0.8), (0.2, 0.5), (-3.0, 0.3), (0.0, 5.0)])
+def test_entropy_of_the_gait_is_that_of_the_decoders_choice(mean, std):
+    decoder, rng = CommandDecoder(action_limit=2.0), np.random.default_rng(0)
+    actions = np.zeros((100_000, 13))
+    actions[:, -1] = rng.normal(mean, std, len(actions))
+    share = np.bincount(decoder.gait(actions), minlength=4) / len(actions)
+    expected = -(share[share > 0.0] * np.log(share[share > 0.0])).sum()
+    found = gait_entropy(th.tensor([mean]), th.tensor(std), 2.0, 4)
+    assert found.item() == pytest.approx(expected, abs=0.01)
+
+
+def test_a_bonus_on_the_gaits_entropy_falls_to_nothing():
+    kwargs = {"policy_kwargs": {"gait": GaitNoise(ENVS, 4)}, "ent_coef": 0.01}
+    model = make_model(FastRecurrentPolicy, gait_ent_coef=0.04, **kwargs)
+    policy = model.policy
+    bonuses = {}
+
+    def keep(remaining: float) -> float:  # each update asks for its rate
+        bonuses[remaining] = policy.gait_bonus
+        return 3e-3
+
+    model.lr_schedule = keep
+    model.learn(4 * ENVS * STEPS)
+    assert bonuses == pytest.approx({0.75: 3.0, 0.5: 2.0, 0.25: 1.0, 0.0: 0.0})
+    batch = next(model.rollout_buffer.get(ENVS * STEPS))
+    inputs = batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
+    with th.no_grad():
+        *_, without = policy.evaluate_actions(*inputs)
+        policy.gait_bonus = 2.0
+        *_, with_bonus = policy.evaluate_actions(*inputs)
+    assert 0.0 < (with_bonus - without).min() and (with_bonus - without).max() < 2.0 * np.log(4.0)
+    # It holds gaits alive: minimised alone, it spreads a channel that was sure of the first gait.
+    mean, log_std = th.full((1,), -1.5, requires_grad=True), th.tensor(-1.0, requires_grad=True)
+    optimiser = th.optim.Adam([mean, log_std], lr=0.05)
+    for _ in range(100):
+        optimiser.zero_grad()
+        (-gait_entropy(mean, log_std.exp(), 2.0, 4).sum()).backward()
+        optimiser.step()
+    assert gait_entropy(mean, log_std.exp(), 2.0, 4).item() > 0.95 * np.log(4.0)

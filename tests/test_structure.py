@@ -28,9 +28,10 @@ FLOORS = (
     ("learn", "benchmark"),
     ("show", "bench", "calibration", "export"),
     ("train_low", "train_high", "evaluate"),
+    ("ablate",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
-SCRIPTS = FLOORS[-1]
+SCRIPTS = FLOORS[-2]
 #: Names that scripts of others import, each from where it is defined.
 DOORS = {
     "terrain": ("sim.terrain", {"make_tile"}),

@@ -27,6 +27,7 @@ import train_low
 from tdgc import calibration, policies
 from tdgc.config import (
     CalibrationConfig,
+    HighTrainConfig,
     LowTrainConfig,
     PPOConfig,
     from_dict,
@@ -39,6 +40,7 @@ from tdgc.learn.run import Interruption, append_line
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
 from tdgc.policies import AsymmetricActorCriticPolicy
+from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
 from tdgc.tasks.high_env import PRETRAINED
@@ -418,6 +420,42 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert final(broken) == final(whole)
 
 
+def test_from_scratch_on_terrain_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bumps that no family has and no teacher knows. A feed-forward policy whose run is stopped
+    while noise of the gait is held ends as one that never stopped."""
+    x, y = np.meshgrid(np.linspace(0.0, 8.0, 161), np.linspace(0.0, 8.0, 161), indexing="ij")
+    bumps = tmp_path / "bumps.npy"
+    np.save(bumps, 0.1 * np.sin(2.0 * np.pi * x / 1.6) * np.cos(2.0 * np.pi * y / 1.6))
+    arguments = [
+        "--no-teacher", "--seed", "3", "--n-envs", "4", "--workers", "1", "--steps", "96",
+        "--set", f'env.families=["{bumps}"]', "--set", "ppo.lstm=null", "--set", "log_steps=32",
+        "--set", "ppo.n_steps=8", "--set", "ppo.minibatches=2", "--set", "ppo.n_epochs=2",
+        "--set", "env.episode_seconds=1.3",
+    ]  # fmt: skip
+    monkeypatch.chdir(ROOT)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    assert train_high.main([*arguments, "--out", str(whole)]) == 0
+    stored = from_dict(HighTrainConfig, json.loads((whole / "config.json").read_text()))
+    assert (stored.imitation.steps, stored.ppo.gait_hold, stored.ppo.lstm) == (0, 10, None)
+    assert stored.env.shallowest_trench == 0.05 and stored.env.rewards.map_radius == 6.5
+    assert [row["steps"] for row in rows(whole)] == [32, 64, 96]
+    assert all(row[f"level/{bumps}"] == 0.0 for row in rows(whole))
+    shares = [sum(row[f"gait/{bumps}_{gait}"] for gait in GAITS) for row in rows(whole)]
+    assert shares == pytest.approx([1.0] * 3, abs=1e-3)
+    assert (whole / "training.png").is_file()
+    made = policies.load(whole / "policy")
+    assert made.kind == "mlp" and made.meta["config"]["families"] == [str(bumps)]
+    with monkeypatch.context() as patch:
+        at_calls(patch, lambda call, run: setattr(run, "reason", "a test" if call == 2 else None))
+        assert train_high.main([*arguments, "--out", str(broken)]) == 0
+    noise, age = Checkpoint.read(newest(broken)).tensors["policy.held"]
+    assert noise.all() and (age > 0.0).all() and (age < 10.0).all()
+    assert train_high.main(["--resume", "--out", str(broken)]) == 0
+    assert final(broken) == final(whole)
+
+
 def test_calibration_ends_a_run_of_the_low_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -534,6 +572,9 @@ def test_flags_and_folders_that_cannot_be_used(
         ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
         ("env.unknown_share=1.5", "'env.unknown_share' must be from 0 to 1, not 1.5"),
         ("env.unknown_share=-0.1", "'env.unknown_share' must be from 0 to 1, not -0.1"),
+        ("env.gaits=[]", "gaits must be some of trot, pronk, pace, bound, each once, not []"),
+        ("ppo.gait_hold=0", "'ppo.gait_hold' must be at least 1, not 0"),
+        ("ppo.gait_ent_coef=-1", "'ppo.gait_ent_coef' must be at least 0, and 0 without an ent_"),
     ):
         assert train_high.main(["--set", setting, "--out", str(empty)]) == 2
         assert capsys.readouterr().err.startswith(f"train_high.py: {message}")

@@ -182,6 +182,13 @@ def test_limits_that_do_not_fit_the_policies(assignment, message):
         check(load(None, [assignment]), high, LOW)
 
 
+def test_gaits_of_a_policy_that_has_few_cannot_be_narrowed():
+    few = dataclasses.replace(HIGH, commands=LOW.commands, gaits=("trot", "bound"))
+    with pytest.raises(ConfigError, match=r"can only narrow all gaits; the policy has trot, bound"):
+        check(load(None, ['decoder.gaits=["trot"]']), few, LOW)
+    check(load(None, ["decoder.vx.high=0.5"]), few, LOW)
+
+
 def test_slowing_down_needs_a_low_level_that_can_stand():
     running = dataclasses.replace(LOW, commands=CommandRanges(vx=(0.2, 1.0)))
     high = dataclasses.replace(HIGH, commands=running.commands)

@@ -72,11 +72,13 @@ class CuesLaw:
 
     Args:
         low: the low policy's MDP.
-        landing: of the low policy.
+        landing: of the low policy; None for one that does not leap, which walks over trenches.
         config: the MDP of the decisions.
     """
 
-    def __init__(self, low: LowLevelConfig, landing: Landing, config: HighLevelConfig) -> None:
+    def __init__(
+        self, low: LowLevelConfig, landing: Landing | None, config: HighLevelConfig
+    ) -> None:
         self._low, self._landing, self._steps = low, landing, config.decimation
         self._ranges, self._control_dt = low.commands, low.physics.control_dt
         self._dt = self._steps * self._control_dt
@@ -102,7 +104,8 @@ class CuesLaw:
             state.clock.move(cue["clock"], state.command, self._control_dt, self._steps)
         self._look(state, cue)
         state.command = self._walk(state, distance, bearing)
-        self._leap(state, bearing)
+        if self._landing is not None:
+            self._leap(state, bearing, self._landing)
         # A low policy may have been trained on less than the styles ask for.
         state.command = np.clip(state.command, self._decoder.low, self._decoder.high)
         return self._decoder.encode(state.command), state
@@ -150,7 +153,7 @@ class CuesLaw:
         command[:, INDEX["vx"]], command[:, INDEX["yaw_rate"]] = speed, turn
         return command
 
-    def _leap(self, memory: Memory, bearing: Array) -> None:
+    def _leap(self, memory: Memory, bearing: Array, landing: Landing) -> None:
         """Turn the commands of robots that have trenches before them into those of leaps."""
         late = memory.delay.late().astype(int)
         track = np.choose(late, [profile.track() for profile in memory.profiles])
@@ -168,7 +171,7 @@ class CuesLaw:
             if done and x[i] > lips.max(initial=0.0) + _BEYOND:
                 continue
             if not np.array_equal(lips, memory.planned[i]):
-                memory.plan.look(i, lips, self._landing.spread)
+                memory.plan.look(i, lips, landing.spread)
                 memory.planned[i] = lips
             leaping.append(i)
         if leaping:
@@ -180,6 +183,6 @@ class CuesLaw:
             turn = np.clip(-_TURN * heading[rows], *self._ranges.yaw_rate)
             leaps[:, INDEX["yaw_rate"]] = turn
             clock = memory.clock.now[rows]
-            steps = memory.plan.steps(rows, x[rows], speed[rows], clock, self._landing)
+            steps = memory.plan.steps(rows, x[rows], speed[rows], clock, landing)
             leap_command(leaps, *steps)
             memory.command[rows] = leaps

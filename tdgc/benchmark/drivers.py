@@ -146,7 +146,7 @@ class Decides(Protocol):
 
 
 class HierarchyDriver:
-    """Drives robots by the recurrent high level (paper Sec. IV-B), ``tdgc``.
+    """Drives robots by the high level (paper Sec. IV-B), ``tdgc``; recurrent or feed-forward.
 
     A decision is deterministic and its commands are held for ``decimation`` control steps.
 
@@ -161,7 +161,7 @@ class HierarchyDriver:
         self.action: NDArray[np.floating] | None = None
         self.told: str | None = None
         self.probes: Array | None = None
-        self._decoder = CommandDecoder(config.commands, config.action_limit)
+        self._decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         m, config = loco.num_robots, self.config
@@ -213,7 +213,7 @@ def load_high(
             message names the mismatch.
     """
     high = policies.load(path)
-    if high.kind != "lstm" or high.action_dim != NUM_ACTIONS:
+    if high.action_dim != NUM_ACTIONS:
         raise ConfigError(f"{path}: not a high-level policy of this package")
     try:
         config = recorded(HighLevelConfig, high.meta["config"], path)

@@ -105,11 +105,18 @@ def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, A
     return tree
 
 
+def rates(reached: Iterable[bool]) -> dict[str, float]:
+    """Of episodes, each with whether it reached the goal: how many (n), reached, rate, and its
+    interval ci_low, ci_high."""
+    every = list(reached)
+    n, good = len(every), sum(every)
+    low, high = wilson_interval(good, n)
+    return {"n": n, "reached": good, "rate": good / n, "ci_low": low, "ci_high": high}
+
+
 def success(rows: Sequence[Episode]) -> dict[str, float]:
-    """How many episodes reached the goal: n, reached, rate, and its interval ci_low, ci_high."""
-    n, reached = len(rows), sum(e.outcome == "reached" for e in rows)
-    low, high = wilson_interval(reached, n)
-    return {"n": n, "reached": reached, "rate": reached / n, "ci_low": low, "ci_high": high}
+    """``rates`` of episodes."""
+    return rates(e.outcome == "reached" for e in rows)
 
 
 def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:

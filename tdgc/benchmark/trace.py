@@ -157,7 +157,7 @@ class Tracer:
         self._dt = loco.physics.control_dt
         self._hold = config.decimation
         self._horizon = round(config.episode_seconds / (self._hold * self._dt))
-        self._decoder = CommandDecoder(config.commands, config.action_limit)
+        self._decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
         middle = command_share(self._decoder.decode(np.zeros(NUM_ACTIONS)), self._decoder)
         self._shares = np.tile(middle, (3, m, 1))
         self._actions = np.zeros((2, m, NUM_ACTIONS))

@@ -169,6 +169,10 @@ def check(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> None:
         raise ConfigError(
             f"decoder.gaits must name some of {', '.join(GAITS)}, each once, not {list(gaits)}"
         )
+    if set(gaits) != set(GAITS) and set(config.gaits) != set(GAITS):
+        raise ConfigError(
+            f"decoder.gaits can only narrow all gaits; the policy has {', '.join(config.gaits)}"
+        )
     for name, value in dataclasses.asdict(safety).items():
         if value is not None and not value > 0.0:
             raise ConfigError(f"safety.{name} must be positive, not {value}")

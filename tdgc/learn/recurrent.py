@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from numpy.typing import NDArray
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
@@ -24,28 +26,63 @@ from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.common.recurrent.type_aliases import RecurrentRolloutBufferSamples, RNNStates
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from tdgc.policies.files import Mirror
-from tdgc.policies.learning import MirroredHead, MirroredLSTM, MirroredMlpExtractor
+from tdgc.policies.learning import MirroredHead, MirroredLSTM, MirroredMlpExtractor, NoMemory
+
+
+@dataclass(frozen=True)
+class GaitNoise:
+    """How the gait channel, the last action, explores.
+
+    Attributes:
+        robots: that decide at once.
+        gaits: that it chooses from, in equal shares of the action's range.
+        hold: decisions that its noise is held for, within an episode. Each decision's noise is
+            still normally distributed, and its likelihood is that of one decision.
+    """
+
+    robots: int
+    gaits: int
+    hold: int = 1
 
 
 class FastRecurrentPolicy(RecurrentActorCriticPolicy):
     """``MlpLstmPolicy`` with a fast ``evaluate_actions``; for ``FastRecurrentPPO``.
 
     It takes the same arguments, has the same parameters and computes the same numbers; with a
-    ``mirror`` it is exactly left-right symmetric, and so is its value.
+    ``mirror`` it is exactly left-right symmetric, and so is its value. With None for
+    ``lstm_hidden_size`` it is feed-forward, and the networks behind the LSTMs are all there is.
+
+    Attributes:
+        gait_bonus: weight of the gaits' entropy beside that of the normal distributions in what
+            ``evaluate_actions`` gives as entropy.
 
     Raises:
         ValueError: other LSTMs than plain ones of one layer, one each for actor and critic, or
             other actions than normally distributed ones with one deviation each.
     """
 
-    def __init__(self, *args: Any, mirror: Mirror | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        *,
+        mirror: Mirror | None = None,
+        lstm_hidden_size: int | None = 256,
+        gait: GaitNoise | None = None,
+        **kwargs: Any,
+    ) -> None:
         # SB3's Adam, in one operation instead of a dozen for each parameter.
         kwargs.setdefault("optimizer_kwargs", {"eps": 1e-5, "fused": True})
-        self.mirror = mirror
-        super().__init__(*args, **kwargs)
+        self.mirror, self.gait, self.gait_bonus = mirror, gait, 0.0
+        size = observation_space.shape[0] if lstm_hidden_size is None else lstm_hidden_size
+        super().__init__(
+            observation_space, action_space, lr_schedule, lstm_hidden_size=size, **kwargs
+        )
         plain = self.lstm_actor.num_layers == 1 and not self.lstm_kwargs
         if self.lstm_critic is None or not plain or not self.share_features_extractor:
             raise ValueError(
@@ -54,9 +91,23 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
             )
         if not isinstance(self.action_dist, DiagGaussianDistribution):
             raise ValueError("FastRecurrentPolicy has normally distributed actions, without gSDE")
+        if lstm_hidden_size is None:
+            self.lstm_actor = NoMemory(size)  # type: ignore[assignment]
+            self.lstm_critic = NoMemory(size)  # type: ignore[assignment]
+            self.lstm_hidden_state_shape = (1, 1, self.lstm_actor.hidden_size)
+            self.optimizer = self.optimizer_class(
+                self.parameters(),
+                lr=lr_schedule(1),  # type: ignore[call-arg]  # as SB3 has it
+                **self.optimizer_kwargs,
+            )
+        if gait is not None and gait.hold > 1:
+            # The noise that is held, and for how many decisions by now; a checkpoint keeps it.
+            self.held: th.Tensor
+            self.register_buffer("held", th.zeros(2, gait.robots))
         if mirror is not None:  # the parameters stay, so the optimiser has them
             self.lstm_actor = MirroredLSTM(self.lstm_actor, mirror)  # type: ignore[assignment]
-            self.lstm_critic = MirroredLSTM(self.lstm_critic, mirror)  # type: ignore[assignment]
+            critic = cast(nn.LSTM, self.lstm_critic)
+            self.lstm_critic = MirroredLSTM(critic, mirror)  # type: ignore[assignment]
             self.lstm_hidden_state_shape = (1, 1, self.lstm_actor.hidden_size)
             self.action_net = MirroredHead(cast(nn.Linear, self.action_net), mirror)
             self.value_net = MirroredHead(self.value_net, None)  # type: ignore[assignment]
@@ -69,6 +120,28 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "mirror": self.mirror}
+
+    def forward(  # type: ignore[override]  # as sb3-contrib has it
+        self,
+        obs: th.Tensor,
+        lstm_states: RNNStates,
+        episode_starts: th.Tensor,
+        deterministic: bool = False,
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, RNNStates]:
+        """As ``MlpLstmPolicy`` has it; the gait channel's noise is held, see ``GaitNoise``."""
+        actions, values, log_prob, states = super().forward(
+            obs, lstm_states, episode_starts, deterministic
+        )
+        if deterministic or self.gait is None or self.gait.hold == 1:
+            return actions, values, log_prob, states
+        normal = cast(th.distributions.Normal, self.action_dist.distribution)
+        mean, std = normal.mean[:, -1], normal.stddev[:, -1]
+        noise, age = self.held
+        over = (episode_starts > 0.0) | (age >= self.gait.hold)
+        noise = th.where(over, (actions[:, -1] - mean) / std, noise)
+        self.held = th.stack([noise, th.where(over, 1.0, age + 1.0)])
+        actions[:, -1] = mean + std * noise
+        return actions, values, self.action_dist.log_prob(actions), states
 
     def evaluate_actions(  # type: ignore[override]  # as sb3-contrib has it
         self, obs: th.Tensor, actions: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor
@@ -107,7 +180,13 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         latent_vf = run(cast(nn.LSTM, self.lstm_critic), lstm_states.vf)
         values = self.value_net(self.mlp_extractor.forward_critic(latent_vf))
         mean = self.action_net(self.mlp_extractor.forward_actor(latent_pi))
-        return values, *gaussian(actions, mean, self.log_std)
+        log_prob, entropy = gaussian(actions, mean, self.log_std)
+        if self.gait is not None and self.gait_bonus > 0.0:
+            limit = float(cast(spaces.Box, self.action_space).high[-1])
+            std = self.log_std[-1].exp()
+            gaits = gait_entropy(mean[:, -1], std, limit, self.gait.gaits)
+            entropy = entropy + self.gait_bonus * gaits
+        return values, log_prob, entropy
 
 
 def gaussian(x: th.Tensor, mean: th.Tensor, log_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -119,6 +198,21 @@ def gaussian(x: th.Tensor, mean: th.Tensor, log_std: th.Tensor) -> tuple[th.Tens
     size = 0.5 * math.log(2.0 * math.pi) * len(log_std) + log_std.sum()
     log_prob = -0.5 * ((x - mean) * (-log_std).exp()).square().sum(1) - size
     return log_prob, (0.5 * len(log_std) + size).expand(len(x))
+
+
+def gait_entropy(mean: th.Tensor, std: th.Tensor, limit: float, gaits: int) -> th.Tensor:
+    """Entropy in nats of the gait that a normally distributed channel chooses, (n,).
+
+    Args:
+        mean: (n,) of the channel; its noise has the deviation ``std``.
+        limit: the channel's range is from -limit to limit; what is beyond counts as its end.
+        gaits: that share the range equally.
+    """
+    edges = th.linspace(-limit, limit, gaits + 1, device=mean.device)[1:-1]
+    below = th.special.ndtr((edges - mean[:, None]) / std)
+    nothing = th.zeros_like(mean)[:, None]
+    share = th.diff(below, prepend=nothing, append=nothing + 1.0).clamp(min=1e-8)
+    return -(share * share.log()).sum(1)
 
 
 class _Everything:
@@ -181,9 +275,25 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
 class FastRecurrentPPO(RecurrentPPO):
     """``RecurrentPPO`` with ``WholeEnvBuffer``.
 
+    Args:
+        gait_ent_coef: weight of the gaits' entropy (``GaitNoise``) in the loss at the first step;
+            it falls linearly to nothing at the last. It needs an ``ent_coef`` above 0 beside it.
+
     Raises:
         ValueError: a ``batch_size`` below ``n_steps``, which holds no environment's rollout.
     """
+
+    def __init__(self, *args: Any, gait_ent_coef: float = 0.0, **kwargs: Any) -> None:
+        self.gait_ent_coef = gait_ent_coef
+        super().__init__(*args, **kwargs)
+
+    def train(self) -> None:
+        """One update."""
+        if self.gait_ent_coef:
+            # SB3 multiplies all of the entropy by ``ent_coef``.
+            bonus = self.gait_ent_coef * self._current_progress_remaining / self.ent_coef
+            cast(FastRecurrentPolicy, self.policy).gait_bonus = bonus
+        super().train()
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -99,8 +99,29 @@ class MirroredHead(nn.Module):
         return cast(th.Tensor, 0.5 * (seen + mirrored[..., index] * sign))
 
 
+class NoMemory(nn.Module):
+    """Stands where an LSTM does in a feed-forward policy: it hands on what it is given.
+
+    It is called as ``nn.LSTM`` is; its state is a zero per robot that stays one.
+
+    Attributes:
+        input_size, hidden_size, num_layers: as ``nn.LSTM`` has them.
+    """
+
+    def __init__(self, input_size: int) -> None:
+        super().__init__()
+        self.input_size, self.hidden_size, self.num_layers = input_size, 1, 1
+
+    def forward(
+        self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
+    ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
+        """(steps, n, input_size) and the state -> both as they came."""
+        return x, state
+
+
 class MirroredLSTM(nn.Module):
-    """An LSTM that sees an observation and its mirror image, in two halves of a wider state.
+    """An LSTM, or ``NoMemory``, that sees an observation and its mirror image, in two halves of a
+    wider state.
 
     It is called as ``nn.LSTM`` is. ``MirroredMlpExtractor`` and ``MirroredHead`` go on with the
     halves.
@@ -110,7 +131,7 @@ class MirroredLSTM(nn.Module):
         input_size, hidden_size, num_layers: as ``nn.LSTM`` has them, seen from outside.
     """
 
-    def __init__(self, lstm: nn.LSTM, mirror: Mirror) -> None:
+    def __init__(self, lstm: nn.LSTM | NoMemory, mirror: Mirror) -> None:
         super().__init__()
         self.lstm = lstm
         self.input_size, self.num_layers = lstm.input_size, lstm.num_layers
@@ -224,8 +245,9 @@ def save(path: str | os.PathLike[str], policy: ActorCriticPolicy, meta: dict[str
     Args:
         path: with or without one of the two suffixes; missing folders are made.
         policy: ``AsymmetricActorCriticPolicy``, SB3's ``MlpPolicy`` or sb3-contrib's
-            ``MlpLstmPolicy`` (one layer, an LSTM each for actor and critic) and subclasses, with
-            a flat Box observation and action and a state-independent standard deviation.
+            ``MlpLstmPolicy`` (one layer, an LSTM each for actor and critic, or ``NoMemory`` in
+            their places) and subclasses, with a flat Box observation and action and a
+            state-independent standard deviation.
         meta: anything JSON can say: configuration, seed, steps, wall time, code version.
 
     Raises:
@@ -283,7 +305,8 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
 
     lstm = None
     if isinstance(policy, RecurrentActorCriticPolicy):
-        lstm = _inner(policy.lstm_actor).hidden_size
+        memory = _inner(policy.lstm_actor)
+        lstm = None if isinstance(memory, NoMemory) else memory.hidden_size
         if policy.lstm_critic is None or policy.lstm_kwargs or policy.lstm_actor.num_layers != 1:
             raise ValueError("only plain LSTMs of one layer, one each for actor and critic")
     tensors = _tensors(policy)
@@ -311,7 +334,7 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
     )
 
 
-def _inner(lstm: nn.LSTM | MirroredLSTM) -> nn.LSTM:
+def _inner(lstm: nn.LSTM | NoMemory | MirroredLSTM) -> nn.LSTM | NoMemory:
     return lstm.lstm if isinstance(lstm, MirroredLSTM) else lstm
 
 
@@ -325,8 +348,9 @@ def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
     ):
         if isinstance(policy, RecurrentActorCriticPolicy):
             lstm = _inner(getattr(policy, f"lstm_{net}"))
-            for tensor in LSTM_TENSORS:
-                tensors[f"{net}_lstm.{tensor}"] = getattr(lstm, f"{tensor}_l0")
+            if isinstance(lstm, nn.LSTM):
+                for tensor in LSTM_TENSORS:
+                    tensors[f"{net}_lstm.{tensor}"] = getattr(lstm, f"{tensor}_l0")
         head = output.linear if isinstance(output, MirroredHead) else output
         layers = [m for m in (*body, head) if isinstance(m, nn.Linear)]
         for i, layer in enumerate(layers):

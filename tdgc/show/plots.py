@@ -416,6 +416,28 @@ def decision_curve(log: Path, out: Path) -> None:
     _curves(log, out, panels, "million decisions")
 
 
+def ablation(table: Path, out: Path) -> None:
+    """Success with 95 % intervals of each variant (ablation.json), and of each seed as a dot. A
+    line is at that of the first, with which the others are compared."""
+    every: list[dict[str, Any]] = json.loads(table.read_text(encoding="utf-8"))["rows"]
+    rows = [row for row in every if "n" in row]
+    height = 1.0 + 0.3 * max(len(rows), 1)
+    figure, axis = plt.subplots(figsize=(7.5, height), layout="constrained")
+    for y, row in enumerate(rows):
+        rate, low, high = (100 * row[key] for key in ("rate", "ci_low", "ci_high"))
+        ends = [[max(0.0, rate - low)], [max(0.0, high - rate)]]
+        axis.barh(y, rate, xerr=ends, capsize=2, color=POLICY_COLOURS["tdgc"], alpha=0.6)
+        if len(row["seeds"]) > 1:
+            axis.plot([100 * r for r in row["seeds"].values()], [y] * len(row["seeds"]), "k.")
+    if rows:
+        axis.axvline(100 * rows[0]["rate"], color="0.5", linestyle=":")
+    axis.set_yticks(range(len(rows)), [f"{row['name']}: {row['what']}" for row in rows], fontsize=8)
+    axis.invert_yaxis()
+    axis.set(xlabel="success (%)", xlim=(0, 100))
+    axis.grid(alpha=0.3, axis="x")
+    _save(figure, out)
+
+
 def _curves(
     log: Path, out: Path, panels: Sequence[tuple[str, dict[str, str] | str]], unit: str
 ) -> None:

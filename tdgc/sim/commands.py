@@ -22,6 +22,7 @@ index   name           unit   meaning
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,18 +84,29 @@ class CommandDecoder:
         low, high: (15,) bounds l_j and u_j; the embedding is within [0, 0.5].
         units: the 15 units.
         action_limit: a_max, the clip of the raw action.
+        gaits: indices of the gaits that the last channel chooses from; all four by default.
     """
 
     names = NAMES
     units = UNITS
 
-    def __init__(self, ranges: CommandRanges | None = None, action_limit: float = 1.0) -> None:
+    def __init__(
+        self,
+        ranges: CommandRanges | None = None,
+        action_limit: float = 1.0,
+        gaits: Sequence[str] = GAITS,
+    ) -> None:
         if not action_limit > 0.0:
             raise ValueError(f"action_limit must be positive, not {action_limit}")
+        if not gaits or len(set(gaits)) < len(gaits) or not set(gaits) <= set(GAITS):
+            raise ValueError(
+                f"gaits must be some of {', '.join(GAITS)}, each once, not {list(gaits)}"
+            )
         bounds = np.array(dataclasses.astuple(ranges or CommandRanges()), dtype=np.float64)
         self.low = np.concatenate([bounds[:, 0], np.zeros(3)])
         self.high = np.concatenate([bounds[:, 1], np.full(3, 0.5)])
         self.action_limit = action_limit
+        self.gaits = np.array([GAITS.index(name) for name in gaits])
 
     def normalise(self, action: ArrayLike) -> NDArray[np.float64]:
         """x = clip(a, -a_max, a_max) / a_max.
@@ -110,9 +122,12 @@ class CommandDecoder:
         return np.clip(raw, -self.action_limit, self.action_limit) / self.action_limit
 
     def gait(self, action: ArrayLike) -> NDArray[np.int64]:
-        """g = clip(floor(2 (x_g + 1)), 0, 3): (..., 13) -> (...)."""
+        """g = clip(floor(2 (x_g + 1)), 0, 3): (..., 13) -> (...); of n gaits the same with n / 2
+        and n - 1."""
         x = self.normalise(action)[..., -1]
-        return np.clip(np.floor(2.0 * (x + 1.0)), 0, len(GAITS) - 1).astype(np.int64)
+        n = len(self.gaits)
+        place = np.clip(np.floor(0.5 * n * (x + 1.0)), 0, n - 1).astype(np.int64)
+        return np.asarray(self.gaits[place])
 
     def decode(self, action: ArrayLike) -> NDArray[np.float64]:
         """c = [l + (x + 1) / 2 (u - l), e(g)]: (..., 13) -> (..., 15).
@@ -129,7 +144,8 @@ class CommandDecoder:
         """The action in the middle of those that decode to ``command``: (..., 15) -> (..., 13).
 
         Raises:
-            ValueError: a command outside the bounds, named with them.
+            ValueError: a command outside the bounds, named with them, or a gait that is none of
+                ``gaits``.
         """
         c = np.asarray(command, dtype=np.float64)
         for j, name in enumerate(CONTINUOUS):
@@ -137,10 +153,26 @@ class CommandDecoder:
             if not inside.all():
                 worst = c[..., j][~inside].flat[0]
                 raise ValueError(f"{name} {worst} is outside [{self.low[j]}, {self.high[j]}]")
+        is_gait = gait_index(c)[..., None] == self.gaits
+        if not is_gait.any(axis=-1).all():
+            names = ", ".join(GAITS[g] for g in self.gaits)
+            gait = GAITS[gait_index(c)[~is_gait.any(axis=-1)].flat[0]]
+            raise ValueError(f"gait {gait} is none of {names}")
         low, high = self.low[:12], self.high[:12]
-        x = 2.0 * (c[..., :12] - low) / np.where(high > low, high - low, 1.0) - 1.0
-        gait = (gait_index(c)[..., None] + 0.5) / 2.0 - 1.0
+        free = high > low
+        x = np.where(free, 2.0 * (c[..., :12] - low) / np.where(free, high - low, 1.0) - 1.0, 0.0)
+        place = is_gait.argmax(axis=-1)[..., None]
+        gait = (place + 0.5) / (0.5 * len(self.gaits)) - 1.0
         return self.action_limit * np.concatenate([x, gait], axis=-1)
+
+    def nearest(self, command: ArrayLike) -> NDArray[np.float64]:
+        """The command next to one that may be outside the bounds: (..., 15) -> (..., 15). Where its
+        gait is none of ``gaits``, it has the first of them."""
+        c = np.clip(np.asarray(command, dtype=np.float64), self.low, self.high)
+        gait = gait_index(c)
+        known = np.isin(gait, self.gaits)
+        c[..., 12:] = gait_embedding(np.where(known, gait, self.gaits[0]))
+        return c
 
 
 def gait_index(commands: NDArray[np.floating]) -> NDArray[np.int64]:

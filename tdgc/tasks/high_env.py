@@ -7,6 +7,7 @@ curriculum sets; ``NavigationEnv`` is its Gymnasium face for one.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,15 @@ from tdgc.config import (
     recorded,
 )
 from tdgc.policies import Mirror, Policy
-from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS, CommandDecoder, gait_index
+from tdgc.sim.commands import (
+    CONTINUOUS,
+    INDEX,
+    NUM_ACTIONS,
+    SIDEWAYS,
+    CommandDecoder,
+    default_command,
+    gait_index,
+)
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
 from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, in_place, mirror, observe, width
@@ -47,7 +56,7 @@ from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, has_failed, outcome
 from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.teacher import Teacher
-from tdgc.tasks.tiles import TrainingTiles
+from tdgc.tasks.tiles import TrainingTiles, shallow
 
 #: Where the shipped policies are.
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
@@ -204,22 +213,39 @@ def high_step(
     )
 
 
+#: What a high policy decides, beside the gait, when its ``behaviour`` is "velocities".
+VELOCITIES = ("vx", "vy", "yaw_rate")
+
+
+def at_default(ranges: CommandRanges) -> CommandRanges:
+    """Bounds that leave only the velocities free: the others at their defaults, or at the bound
+    next to it."""
+    default, pinned = default_command(), {}
+    for name in CONTINUOUS:
+        if name not in VELOCITIES:
+            value = float(np.clip(default[INDEX[name]], *getattr(ranges, name)))
+            pinned[name] = value, value
+    return dataclasses.replace(ranges, **pinned)
+
+
 def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
-    """The MDP of a high policy on a low policy: with the decoder's bounds, if it has none.
+    """The MDP of a high policy on a low policy: with the decoder's bounds, the low policy's if it
+    has none.
 
     Raises:
         ConfigError: bounds that the low policy was not trained on; names the command and both.
     """
-    if high.commands is None:
-        return dataclasses.replace(high, commands=low.commands)
+    ranges = high.commands or low.commands
+    if high.behaviour == "velocities":
+        ranges = at_default(ranges)
     for f in dataclasses.fields(low.commands):
-        asked, trained = getattr(high.commands, f.name), getattr(low.commands, f.name)
+        asked, trained = getattr(ranges, f.name), getattr(low.commands, f.name)
         if asked[0] < trained[0] or asked[1] > trained[1]:
             raise ConfigError(
                 f"commands.{f.name} asks for {list(asked)}, but the low policy was trained on "
                 f"{list(trained)}"
             )
-    return high
+    return dataclasses.replace(high, commands=ranges)
 
 
 def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
@@ -271,15 +297,20 @@ class NavigationTask:
         self._visual = visual
         self.num_robots = m = num_robots
         self.training = training
-        self.decoder = CommandDecoder(config.commands, config.action_limit)
+        self.decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
         self.rng = np.random.default_rng(seed)
         self.step_seconds = config.decimation * self.low_config.physics.control_dt
         self.horizon = round(config.episode_seconds / self.step_seconds)
         self._hold = round(config.hold_seconds / self.step_seconds)
         self.family = np.arange(m) % len(config.families)
         first = np.arange(m) // len(config.families) % config.first_levels
+        if config.curriculum == "hardest":
+            first[:] = config.levels - 1
         self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, first)
-        self.tiles = TrainingTiles([config.families[f] for f in self.family], seed)
+        alter = None
+        if training and config.shallowest_trench is not None:
+            alter = functools.partial(shallow, shallowest=config.shallowest_trench)
+        self.tiles = TrainingTiles([config.families[f] for f in self.family], seed, alter)
         self.field = self.tiles.field
         self._build_robots()
         self._origin = self.field.origin(np.arange(m), 0)
@@ -313,6 +344,8 @@ class NavigationTask:
     def reset(self, index: NDArray[np.integer]) -> None:
         """Start new episodes for the robots ``index`` (n,)."""
         n, rng = len(index), self.rng
+        if self.training and self.config.curriculum == "uniform":
+            self.curriculum.levels[index] = rng.integers(self.config.levels, size=n)
         changed = self.tiles.begin(index, self.curriculum.levels)
         if changed.size:
             self.locomotion.world.upload_terrain(changed)
@@ -397,7 +430,7 @@ class NavigationTask:
         self._count(terms, reward, commands, done, reached)
         if self.training:
             own = done[~self._led[done]]  # the teacher's episodes say nothing of the policy
-            if own.size:
+            if own.size and c.curriculum == "performance":
                 self.curriculum.push(own, reached[own])
             self._pushes.push(loco.world, self.elapsed, self._width())
         return reward, failed, truncated
@@ -416,7 +449,7 @@ class NavigationTask:
         if self.teacher is None:
             return seen
         commands = self.teacher.commands(self.locomotion, self.goal)
-        self._taught = self.decoder.encode(commands)
+        self._taught = self.decoder.encode(self.decoder.nearest(commands))
         return np.concatenate([seen, self._taught], axis=1, dtype=np.float32)
 
     @property

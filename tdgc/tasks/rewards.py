@@ -383,12 +383,14 @@ if not set(HIGH_TERMS) <= {f.name for f in dataclasses.fields(HighRewardConfig)}
 
 
 def high_terms(step: HighStep, dt: float) -> dict[str, Array]:
-    """Every enabled term times its effective weight w_i dt (step-time scaling), (M,) each.
+    """Every enabled term times its effective weight w_i dt (step-time scaling), (M,) each; w_i
+    alone without ``step_time_scaling``.
 
     The high level's reward is their plain sum.
     """
+    scale = dt if step.config.step_time_scaling else 1.0
     return {
-        name: weight * dt * term(step)
+        name: weight * scale * term(step)
         for name, term in HIGH_TERMS.items()
         if (weight := getattr(step.config, name)) != 0.0
     }

@@ -1,0 +1,1 @@
+"""The ablation: variants of the hierarchy, their cells, the table."""

@@ -1,0 +1,191 @@
+"""The ablation: what each part of the hierarchy is worth, on the same tiles, at the same budget.
+
+    python -m tdgc.ablate --out runs/ablation
+    python -m tdgc.ablate --out runs/ablation --only full,trot --seeds 42,43
+    python -m tdgc.ablate --out runs/alone --no-teacher
+
+Each variant is a list of settings, trained by train_high.py from scratch and evaluated by
+evaluate.py; some are evaluated only, with the policy of ``full``. Stopped or killed at any moment,
+the same command goes on where it was, within a training too. A cell that fails is named with its
+error, and the others are kept. Writes ``ablation.json``, ``ablation.txt`` and ``ablation.png``.
+
+It is run where the scripts are, in the root of the repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import evaluate
+from tdgc.ablate.cells import Cell, CellError, Runner, StoppedError
+from tdgc.ablate.table import Found, describe, rows
+from tdgc.ablate.variants import Variant, variants
+from tdgc.config import HighTrainConfig, read_json, with_overrides
+from tdgc.errors import InputError
+from tdgc.parallel.cores import workers_flag
+from tdgc.show import plots
+from tdgc.tasks.high_env import PRETRAINED, load_low
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", metavar="NAMES", help="some of the variants (all)")
+    parser.add_argument("--seeds", default="42", help="of the trainings, e.g. 42,43 (42)")
+    parser.add_argument("--steps", type=int, help="decisions of a training (train_high.py's own)")
+    parser.add_argument("--levels", default="6-10", help="that are evaluated (6-10)")
+    parser.add_argument("--episodes", type=int, default=100, help="of a family and level (100)")
+    parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low policy (shipped)")
+    parser.add_argument(
+        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
+    )
+    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds")
+    parser.add_argument(
+        "--no-teacher", action="store_true", help="train all variants without a teacher"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
+        help="of all trainings, as train_high.py has it; may be repeated",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path("runs/ablation"), help="results folder")
+    return parser.parse_args(arguments)
+
+
+def choose(only: str | None, allowed: Sequence[Variant]) -> list[Variant]:
+    """The variants that ``--only`` names, in the table's order.
+
+    Raises:
+        InputError: a name that is none.
+    """
+    names = [variant.name for variant in allowed]
+    wanted = names if only is None else only.split(",")
+    for name in wanted:
+        if name not in names:
+            raise InputError(f"unknown variant '{name}'; allowed: {', '.join(names)}")
+    return [variant for variant in allowed if variant.name in wanted]
+
+
+def choose_seeds(text: str) -> list[int]:
+    """``42,43`` as numbers.
+
+    Raises:
+        InputError: something else.
+    """
+    try:
+        return list(dict.fromkeys(int(part) for part in text.split(",")))
+    except ValueError:
+        raise InputError(f"cannot read --seeds '{text}'; write e.g. 42,43") from None
+
+
+def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Cell]:
+    """All cells: one seed after the other, and what is not trained, but a script, once."""
+    return [
+        Cell(variant, seed if variant.policy == "tdgc" else None)
+        for seed in seeds
+        for variant in chosen
+        if variant.policy == "tdgc" or seed == seeds[0]
+    ]
+
+
+def check(runner: Runner, chosen: Sequence[Variant]) -> None:
+    """Refuse before hours of training what would fail after them.
+
+    Raises:
+        ValueError: settings or flags that cannot be used.
+    """
+    for variant in chosen:
+        with_overrides(HighTrainConfig(), runner.training_settings(variant))
+    flags = runner.evaluation_flags("gp", runner.low, None)
+    evaluate.Evaluation.of(evaluate.parse([str(flag) for flag in flags]))
+
+
+def claim(runner: Runner) -> dict[str, Any]:
+    """What all cells in the folder have in common, written down by the first call.
+
+    Raises:
+        InputError: the folder holds cells that cannot be compared with these; or a low policy that
+            cannot be used.
+    """
+    digest = hashlib.sha256()
+    for name, tensor in sorted(load_low(runner.low)[0].tensors.items()):
+        digest.update(name.encode() + tensor.numpy().tobytes())
+    common = {
+        "low": str(runner.low),
+        "low_sha256": digest.hexdigest(),  # its training may have gone on meanwhile
+        "no_teacher": runner.alone,
+        "settings": list(runner.settings),
+        "steps": runner.steps,
+        "levels": runner.levels,
+        "episodes": runner.episodes,
+    }
+    path = runner.out / "settings.json"
+    if not path.is_file():
+        runner.out.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(common, indent=2), encoding="utf-8")
+        return common
+    before = read_json(path)
+    for name, value in common.items():
+        if before.get(name) != value:
+            raise InputError(
+                f"'{runner.out}' holds an ablation with {name} {before.get(name)}, not {value}; "
+                "use another --out"
+            )
+    return common
+
+
+def report(
+    out: Path, common: dict[str, Any], cells: Sequence[Cell], found: Mapping[Cell, Found]
+) -> str:
+    """Write ablation.json, ablation.txt and ablation.png of what there is by now; returns the
+    text."""
+    table = rows(out, cells, found)
+    text = json.dumps({"settings": common, "rows": table}, indent=2)
+    (out / "ablation.json").write_text(text, encoding="utf-8")
+    described = describe(table)
+    (out / "ablation.txt").write_text(f"{described}\n", encoding="utf-8")
+    plots.ablation(out / "ablation.json", out / "ablation.png")
+    return described
+
+
+def main(arguments: list[str] | None = None) -> int:
+    args = parse(arguments)
+    deadline = None if args.time_limit is None else time.monotonic() + args.time_limit
+    runner = Runner(
+        args.out, args.low, args.no_teacher, tuple(args.assignments), args.steps, args.levels,
+        args.episodes, args.workers, deadline,
+    )  # fmt: skip
+    try:
+        chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
+        check(runner, chosen)
+        common = claim(runner)
+    except (ValueError, OSError) as error:
+        print(f"tdgc.ablate: {error}", file=sys.stderr)
+        return 2
+    cells, found, stopped = plan(chosen, seeds), dict[Cell, Found](), False
+    for cell in cells:
+        print(f"{cell.name}: {cell.variant.what}", flush=True)
+        try:
+            found[cell] = runner.run(cell)
+        except CellError as error:
+            found[cell] = str(error)
+        except StoppedError:
+            stopped = True
+            break
+        report(args.out, common, cells, found)
+    print(report(args.out, common, cells, found))
+    if stopped:
+        print("stopped; the same command goes on")
+    failed = {cell.name: message for cell, message in found.items() if isinstance(message, str)}
+    for name, message in failed.items():
+        print(f"tdgc.ablate: {name}: {message}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""The rows of the ablation: what is changed against the whole, as settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from tdgc.config import NO_TEACHER
+
+WHOLE = "full"  # what the others are compared with
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A row of the table.
+
+    Attributes:
+        name: of the row.
+        what: differs from ``full``, in a few words.
+        settings: of its training; None where nothing is trained.
+        alone: more of them where all variants are trained without a teacher.
+        low: the low policy: as given, without calibration, or with the paper's fixed nominal pose.
+        policy: that is evaluated, as evaluate.py names it.
+    """
+
+    name: str
+    what: str
+    settings: tuple[str, ...] | None = None
+    alone: tuple[str, ...] = ()
+    low: Literal["given", "uncalibrated", "fixed-pose"] = "given"
+    policy: Literal["tdgc", "gp", "teacher"] = "tdgc"
+
+
+def _discounts(seconds: float) -> tuple[str, ...]:
+    """Settings that discount as much per second, with decisions of ``seconds``, as the default does
+    with its decisions of 0.1 s."""
+    share = seconds / 0.1
+    return f"ppo.gamma={0.99**share:.6f}", f"ppo.gae_lambda={0.95**share:.6f}"
+
+
+_VELOCITIES = "env.behaviour=velocities"
+
+#: The rows, in order.
+VARIANTS: tuple[Variant, ...] = (
+    Variant(WHOLE, "all parts", ()),
+    Variant(
+        "feed-forward",
+        "no memory, as many parameters",
+        # Actor and critic have 43,944 and 43,164; with an LSTM they have 43,917 and 43,137.
+        ("ppo.lstm=null", "ppo.actor=[285,64]", "ppo.critic=[285,64]"),
+    ),
+    Variant("semantic", "the family, no probes", ("env.cues=semantic",)),
+    Variant("geometric", "probes, no family", ("env.cues=geometric",)),
+    Variant("no-cues", "neither family nor probes", ("env.cues=none",)),
+    Variant("trot", "trot alone", ('env.gaits=["trot"]',)),
+    Variant("velocities", "other commands at their defaults", (_VELOCITIES,)),
+    Variant(
+        "velocities-high-feet",
+        "the same, but feet at 0.19 m",
+        (_VELOCITIES, "env.commands.swing_height=[0.19,0.19]"),
+    ),
+    Variant("uniform", "levels drawn uniformly", ("env.curriculum=uniform",)),
+    Variant("hardest", "the hardest level alone", ("env.curriculum=hardest",)),
+    Variant(
+        "50hz",
+        "a decision per control step",
+        ("env.decimation=1", *_discounts(0.02)),
+        ("ppo.gait_hold=50",),
+    ),
+    Variant(
+        "5hz",
+        "a decision per ten control steps",
+        ("env.decimation=10", *_discounts(0.2)),
+        ("ppo.gait_hold=5",),
+    ),
+    Variant("unscaled", "no step-time scaling", ("env.rewards.step_time_scaling=false",)),
+    Variant("no-teacher", "reinforcement learning alone", NO_TEACHER),
+    Variant("fixed-pose", "the paper's nominal pose", low="fixed-pose"),
+    Variant("uncalibrated", "low policy not calibrated", low="uncalibrated"),
+    Variant("gp", "the scripted baseline", policy="gp"),
+    Variant("gp-fixed-pose", "the same, nominal pose", low="fixed-pose", policy="gp"),
+    Variant("gp-uncalibrated", "the same, not calibrated", low="uncalibrated", policy="gp"),
+    Variant("teacher", "the scripted teacher, told all", policy="teacher"),
+)
+#: With ``--no-teacher`` these stand in the place of ``no-teacher``: what helps it, each taken away.
+HELPS: tuple[Variant, ...] = (
+    Variant("gait-per-decision", "noise of the gait not held", ("ppo.gait_hold=1",)),
+    Variant("gait-per-episode", "noise of the gait held for 20 s", ("ppo.gait_hold=200",)),
+    Variant("no-gait-bonus", "no bonus on the gait's entropy", ("ppo.gait_ent_coef=0",)),
+    Variant("deep", "trenches deep on all levels", ("env.shallowest_trench=null",)),
+    Variant("low-feet", "feet at 0.08 m at the start", ("start_swing=0.08",)),
+    Variant("map-8", "distances as shares of 8 m", ("env.rewards.map_radius=8",)),
+)
+
+
+def variants(alone: bool) -> tuple[Variant, ...]:
+    """The rows of an ablation, with a teacher or without."""
+    if not alone:
+        return VARIANTS
+    place = [variant.name for variant in VARIANTS].index("no-teacher")
+    return VARIANTS[:place] + HELPS + VARIANTS[place + 1 :]

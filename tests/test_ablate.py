@@ -1,0 +1,266 @@
+"""The ablation: variants that train, cells that go on where they were, a table that is right."""
+
+import csv
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import evaluate
+import train_high
+from tdgc import policies
+from tdgc.ablate.__main__ import choose, main, plan
+from tdgc.ablate.cells import Cell, Runner
+from tdgc.ablate.table import describe, rows
+from tdgc.ablate.variants import HELPS, VARIANTS, WHOLE, Variant, variants
+from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, with_overrides
+from tdgc.learn.recurrent import FastRecurrentPolicy
+from tdgc.learn.run import Interruption
+from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_mirror, load_low, paired
+
+ROOT = Path(__file__).resolve().parents[1]
+LOW = PRETRAINED / "low"
+
+pytestmark = pytest.mark.usefixtures("signals")
+
+
+def named(name: str) -> Variant:
+    return next(variant for variant in VARIANTS + HELPS if variant.name == name)
+
+
+# ------------------------------------------------------------------ variants
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_every_variant_changes_one_thing_and_fits_the_low_policy(alone: bool) -> None:
+    base = with_overrides(HighTrainConfig(), NO_TEACHER if alone else ())
+    _, low = load_low(LOW)
+    seen = []
+    for variant in variants(alone):
+        if variant.settings is not None:
+            settings = variant.settings + (variant.alone if alone else ())
+            config = with_overrides(base, settings)
+            high_mirror(paired(config.env, low))
+            seen.append(config)
+    assert seen[0] == base and all(config != base for config in seen[1:])
+    assert all(a != b for i, a in enumerate(seen) for b in seen[:i])
+    names = [variant.name for variant in variants(alone)]
+    assert len(set(names)) == len(names) and ("no-teacher" in names) != alone
+
+
+def test_discounts_are_per_second() -> None:
+    for name, seconds in (("50hz", 0.02), ("5hz", 0.2)):
+        config = with_overrides(HighTrainConfig(), named(name).settings or ())
+        assert config.env.decimation * 0.02 == pytest.approx(seconds)
+        assert config.ppo.gamma ** (1.0 / seconds) == pytest.approx(0.99**10, rel=1e-4)
+        assert config.ppo.gae_lambda ** (1.0 / seconds) == pytest.approx(0.95**10, rel=1e-4)
+
+
+def test_the_feed_forward_variant_has_as_many_parameters() -> None:
+    task = NavigationTask(HighLevelConfig(families=("rough",)), LOW, 1, seed=0)
+    counts = []
+    for variant in (named(WHOLE), named("feed-forward")):
+        ppo = with_overrides(HighTrainConfig(), variant.settings or ()).ppo
+        policy = FastRecurrentPolicy(
+            task.observation_space, task.action_space, lambda _: 0.0,
+            lstm_hidden_size=ppo.lstm, net_arch={"pi": list(ppo.actor), "vf": list(ppo.critic)},
+        )  # fmt: skip
+        # PyTorch's LSTM has a second bias, which adds nothing that it could learn.
+        counts.append(sum(p.numel() for p in policy.parameters()))
+    task.close()
+    assert counts[1] == pytest.approx(counts[0], rel=0.001)
+
+
+# ------------------------------------------------------------------ the table
+
+
+def evaluated(folder: Path, good: Sequence[bool]) -> None:
+    """As evaluate.py leaves a cell: two families, the same number of tiles each."""
+    (folder / "evaluation").mkdir(parents=True)
+    half = len(good) // 2
+    with open(folder / "evaluation" / "episodes.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, ["family", "level", "episode", "outcome"])
+        writer.writeheader()
+        for k, yes in enumerate(good):
+            family, outcome = ("rough", "gap")[k // half], "reached" if yes else "fell"
+            writer.writerow({"family": family, "level": 6, "episode": k % half, "outcome": outcome})
+
+
+def test_rows_are_over_seeds_and_pairs_on_the_same_tiles(tmp_path: Path) -> None:
+    full, trot, gp = named(WHOLE), named("trot"), named("gp")
+    cells = plan([full, trot, named("semantic"), gp], [1, 2])
+    assert [cell.name for cell in cells] == [
+        "full-1", "trot-1", "semantic-1", "gp", "full-2", "trot-2", "semantic-2"
+    ]  # fmt: skip
+    for name, good in (
+        ("full-1", [True] * 6 + [False] * 2),
+        ("full-2", [True] * 8),
+        ("trot-1", [True] * 4 + [False] * 4),
+        ("gp", [False] * 4 + [True] * 4),
+    ):
+        evaluated(tmp_path / name, good)
+    facts = {"steps": 1000, "train_seconds": 1800, "simulated_hours": 0.5}
+    found: dict[Cell, Any] = {
+        Cell(full, 1): facts,
+        Cell(full, 2): {**facts, "train_seconds": 5400},
+        Cell(trot, 1): facts,
+        Cell(trot, 2): "3 faults of workers",
+        Cell(gp, None): {},
+    }
+    table = rows(tmp_path, cells, found)
+    whole, one, later, script = table
+    assert (whole["n"], whole["reached"], whole["versus"]) == (16, 14, None)
+    assert whole["families"] == {"rough": 1.0, "gap": 0.75}
+    assert whole["seeds"] == {"1": 0.75, "2": 1.0}
+    assert (whole["steps"], whole["train_seconds"]) == (1000, 3600)
+    assert (one["n"], one["rate"]) == (8, 0.5) and one["errors"] == {"2": "3 faults of workers"}
+    assert (one["versus"]["n"], one["versus"]["lost"], one["versus"]["gained"]) == (8, 2, 0)
+    assert one["versus"]["difference"] == -0.25
+    assert "n" not in later and later["errors"] == {}
+    # The script runs once, and is compared with both trainings.
+    assert (script["n"], script["versus"]["n"]) == (8, 16) and "steps" not in script
+    assert (script["versus"]["lost"], script["versus"]["gained"]) == (8, 2)
+    text = describe(table)
+    lines = [line.split() for line in text.splitlines()]
+    assert lines[0][:2] == ["variant", "n"] and lines[0][-4:] == ["rough", "gap", "steps", "hours"]
+    assert lines[1] == [
+        "full", "16", "87.5%", "[64.0,", "96.5]", "100.0%", "75.0%", "0.00M", "1.00"
+    ]  # fmt: skip
+    assert lines[2][:6] == ["trot", "8", "50.0%", "[21.5,", "78.5]", "-25.0"]
+    assert lines[3] == ["semantic", "to", "come"]
+    assert text.splitlines()[-1] == "trot, seed 2: 3 faults of workers"
+
+
+# ------------------------------------------------------------------ the whole command
+
+TINY = [
+    "--steps", "48", "--levels", "6", "--episodes", "1", "--workers", "1",
+    "--set", "n_envs=4", "--set", "ppo.n_steps=6", "--set", "ppo.minibatches=2",
+    "--set", "ppo.n_epochs=1", "--set", "imitation.steps=0", "--set", "checkpoint_seconds=1e6",
+    "--set", 'env.families=["tilt"]',
+]  # fmt: skip
+
+
+def in_this_process(work: Callable[[Any], Any], jobs: Sequence[Any], _: int) -> Iterator[Any]:
+    return map(work, jobs)
+
+
+def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Stopped in the middle of its first training, then finished with a cell that cannot be. What
+    it trains is what train_high.py trains."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(evaluate, "spread", in_this_process)
+    out = tmp_path / "ablation"
+    command = [*TINY, "--only", "full,fixed-pose,uncalibrated", "--seeds", "5", "--out", str(out)]
+    asked = []
+
+    def due(interruption: Interruption) -> bool:
+        asked.append(interruption)
+        if len(asked) == 2:
+            interruption.reason = "a test"
+        return interruption.reason is not None
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Interruption, "due", due)
+        assert main(command) == 0
+    assert "stopped; the same command goes on" in capsys.readouterr().out
+    assert policies.load(out / "full-5" / "policy").meta["steps"] == 24
+    assert [row.get("n") for row in json.loads((out / "ablation.json").read_text())["rows"]] == [
+        None, None, None
+    ]  # fmt: skip
+    assert main(command) == 1
+    missing = LOW.with_name("uncalibrated.json")
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f"tdgc.ablate: uncalibrated-5: {missing}: no such file"
+    )
+    result = json.loads((out / "ablation.json").read_text())
+    full, pose, uncalibrated = result["rows"]
+    assert (full["n"], full["steps"], full["simulated_hours"]) == (1, 48, 0.0)
+    assert (pose["n"], pose["versus"]["n"]) == (1, 1) and "steps" not in pose
+    assert uncalibrated["errors"] == {"5": f"{missing}: no such file"}
+    assert result["settings"]["steps"] == 48 and (out / "ablation.png").is_file()
+    # The copies differ from the policies in the pose alone.
+    changed, given = policies.load(out / "fixed-pose-5" / "low"), policies.load(LOW)
+    assert not changed.meta["config"]["robot"]["commanded_pose"]
+    assert all((changed.tensors[n] == given.tensors[n]).all() for n in given.tensors)
+
+    flags = ["--low", str(LOW), "--seed", "5", *TINY[:2], *TINY[6:]]
+    assert train_high.main([*flags, "--out", str(tmp_path / "alone")]) == 0
+    alone = (tmp_path / "alone" / "policy.safetensors").read_bytes()
+    assert (out / "full-5" / "policy.safetensors").read_bytes() == alone
+    # A third call has nothing to do but what failed; others than these settings are refused.
+    before = (out / "full-5" / "cell.json").stat().st_mtime_ns
+    assert main([*command[:-2], "--only", "full", "--out", str(out)]) == 0
+    assert (out / "full-5" / "cell.json").stat().st_mtime_ns == before
+    assert main([*command, "--episodes", "2"]) == 2
+    assert capsys.readouterr().err.endswith(
+        f"tdgc.ablate: '{out}' holds an ablation with episodes 1, not 2; use another --out\n"
+    )
+
+
+def test_a_cell_that_cannot_be_trained_is_named_and_the_others_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two minibatches of two robots' rollouts leave none for one; ``gp`` needs no training."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(evaluate, "spread", in_this_process)
+    flags = [*TINY, "--set", "ppo.minibatches=5", "--only", "full,fixed-pose,gp"]
+    assert main([*flags, "--out", str(tmp_path)]) == 1
+    table = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert table[0]["errors"] == {
+        "42": "a minibatch of 4 steps does not hold the 6 of one environment; take fewer "
+        "minibatches or more environments"
+    }
+    assert table[1]["errors"] == {"42": "it needs 'full' with seed 42, which is not done"}
+    assert (table[2]["n"], table[2]["errors"]) == (1, {})
+    assert capsys.readouterr().err.count("tdgc.ablate: ") == 2
+
+
+def test_time_that_is_over_stops_before_a_cell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*TINY, "--only", "full", "--time-limit", "0", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.endswith("stopped; the same command goes on\n")
+    assert not (tmp_path / "full-42").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--only full,lstm", "unknown variant 'lstm'; allowed: full, feed-forward, "),
+        ("--no-teacher --only no-teacher", "unknown variant 'no-teacher'; allowed: full, "),
+        ("--seeds 1,two", "cannot read --seeds '1,two'; write e.g. 42,43"),
+        ("--levels 6-x", "cannot read --levels '6-x'"),
+        ("--episodes 0", "--episodes must be at least 1, not 0"),
+        ("--set env.cue=none", "unknown configuration key 'env.cue'"),
+        ('--set env.families=["sand"]', "unknown family 'sand'"),
+        ("--low nowhere/low", "nowhere/low.json: no such file"),
+    ],
+)
+def test_flags_that_cannot_be_used(
+    flags: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main([*flags.split(), "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("tdgc.ablate: ") and message in said and said.count("\n") == 1
+    assert not out.exists()
+
+
+def test_variants_are_chosen_in_the_tables_order() -> None:
+    chosen = choose("gp,trot,full", VARIANTS)
+    assert [variant.name for variant in chosen] == ["full", "trot", "gp"]
+
+
+def test_settings_of_a_training_end_with_its_own(tmp_path: Path) -> None:
+    runner = Runner(tmp_path, LOW, True, ("ppo.gait_hold=3",), None, "6", 1, 1, None)
+    assert runner.training_settings(named("trot")) == ("ppo.gait_hold=3", 'env.gaits=["trot"]')
+    assert runner.training_settings(named("50hz"))[-1] == "ppo.gait_hold=50"
+    assert (
+        Runner(tmp_path, LOW, False, (), None, "6", 1, 1, None).training_settings(named("50hz"))
+        == named("50hz").settings
+    )
