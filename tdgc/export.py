@@ -5,8 +5,9 @@
 A graph holds all that stands between a robot's sensors and its joint targets: observation
 (Sec. IV-A, IV-B), network, decoder, phase clock and joint targets. Beside ``low.onnx`` and
 ``low.pt`` stands ``low_interface.json``, which says what goes in and comes out, in which order and
-unit, and how the joints are driven; likewise for ``high``. Afterwards each pair of graphs drives a
-robot in the simulator for as long as an episode, and its outputs are compared with the policies'.
+unit, and how the joints are driven; likewise for ``high``, with the task. The robot's URDF is there
+too. Afterwards each pair of graphs drives a robot in the simulator for as long as an episode, from
+the folder alone (``tdgc.deployment``), and its outputs are compared with the policies'.
 
 All inputs and outputs are vectors of float64. The networks run in float32, as they were trained;
 what surrounds them runs in float64, as in the simulator: a clock in float32 would drift away.
@@ -15,15 +16,11 @@ what surrounds them runs in float64, as in the simulator: a clock in float32 wou
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
-import importlib.util
 import json
-import logging
+import shutil
 import sys
-import time
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,41 +43,43 @@ from tdgc.commands import (
     observed_command,
 )
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
+from tdgc.deployment import (
+    FORMATS,
+    VERSION,
+    Controller,
+    Table,
+    checksum,
+    interface_path,
+    quiet,
+    require,
+)
 from tdgc.drivers import load_high
-from tdgc.errors import install_hint
 from tdgc.gaits import FEET, GAIT_TABLE, GAITS
-from tdgc.geometry import FRONT, JOINTS, SIDE, read_geometry
+from tdgc.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
 from tdgc.high_env import (
     GOAL_SCALE,
     PRETRAINED,
     PROBE_RANGE,
     PROBES,
     SEMANTIC,
-    NavigationTask,
-    height_probes,
     high_layout,
     load_low,
     observe_high,
 )
-from tdgc.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE
-from tdgc.low_env import is_fallen
+from tdgc.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE, Locomotion
+from tdgc.low_env import GOAL_RADIUS, is_fallen
 from tdgc.policies import Policy
-from tdgc.robot import (
-    HIGHEST_FOOT,
-    NUM_JOINTS,
-    Array,
-    foot_kinematics,
-    joint_targets,
-    nominal_pose,
-)
+from tdgc.robot import HIGHEST_FOOT, NUM_JOINTS, Array, foot_kinematics, nominal_pose
+from tdgc.terrain import TileField, make_tile
+from tdgc.world import World
 
-#: Formats and the endings of their files.
-FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
 #: Largest difference allowed between graphs and policies, in the units of the outputs: float32
 #: networks of this size differ by about 1e-6 where two libraries add up in another order.
 TOLERANCE = 1e-5
 
-_ONNX_PACKAGES = ("onnx", "onnxruntime", "onnxscript")  # the extra `export` of setup.cfg
+# The extra `export` of setup.cfg; all but the first are for the format onnx.
+_PACKAGES = ("jsonschema", "onnx", "onnxruntime", "onnxscript")
+_CHECKED_ON = "rough"  # where every step differs from the one before
 
 
 # ---------------------------------------------------------------------------------------------
@@ -107,7 +106,8 @@ class Signal:
         meaning: what it is.
         order: the table in the interface file that names the entries.
         previous: of an input, the input or output whose value of the step before it takes.
-        start: of such an input, what it (or each entry) is in the first step.
+        start: of an input, what it (or each entry) is in the first step of an episode.
+        source: of an input, the output of the other graph whose latest value it takes.
     """
 
     name: str
@@ -117,6 +117,7 @@ class Signal:
     order: str | None = None
     previous: str | None = None
     start: float | tuple[float, ...] | None = None
+    source: str | None = None
 
 
 _BODY = (
@@ -125,6 +126,12 @@ _BODY = (
     Signal("joint_speeds", NUM_JOINTS, "rad/s", "measured speeds", "joints"),
 )
 _GYRO = Signal("gyro", 3, "rad/s", "angular velocity about the trunk's axes: ahead, left, up")
+
+
+def _target_margin(robot: RobotConfig) -> float | None:
+    """rad that joint targets keep from the joint limits; None where they run past them."""
+    margin: float | None = getattr(robot, "joint_margin", None)
+    return margin
 
 
 class ClippedActor(nn.Module):
@@ -217,9 +224,11 @@ class LowLevel(nn.Module):
         self.least = _constant(robot.start_frequency)
         self.counted = ramped or hurried
         self.is_frequency = _constant(np.arange(NUM_COMMANDS) == INDEX["frequency"])
-        # These maps are affine, so their values at 0 and at 1 say all.
-        ones = np.full((1, NUM_JOINTS), robot.action_limit)
-        self.joint_scale = _constant(joint_targets(robot, 0.0 * ones, ones)[0] / robot.action_limit)
+        self.joint_scale = _constant(robot.action_scale * np.tile([robot.hip_scale, 1.0, 1.0], 4))
+        margin = _target_margin(robot)
+        limits = read_geometry(robot).joint_limits.T
+        self.reach = None if margin is None else _constant(limits + [[margin], [-margin]])
+        # This map is affine, so its values at 0 and at 1 say all.
         zero = observed_command(np.zeros(NUM_COMMANDS))
         self.command_zero = _constant(zero)
         self.command_gain = _constant(observed_command(np.ones(NUM_COMMANDS)) - zero)
@@ -229,7 +238,14 @@ class LowLevel(nn.Module):
             *([_GYRO] if config.gyro else []),
             Signal("last_action", NUM_JOINTS, "1", "the last action", "joints", "action", 0.0),
             Signal("action_before", NUM_JOINTS, "1", "before that", "joints", "last_action", 0.0),
-            Signal("commands", NUM_COMMANDS, None, "to follow in this step", "commands"),
+            Signal(
+                "commands",
+                NUM_COMMANDS,
+                None,
+                "to follow in this step",
+                "commands",
+                source="high.commands",
+            ),
             Signal("clock", 1, "1", "share of the gait cycle, in [0, 1)", None, "next_clock", 0.0),
         ]
         if self.counted:
@@ -279,7 +295,10 @@ class LowLevel(nn.Module):
         action = self.actor(th.cat(parts).float()).double().clamp(-self.limit, self.limit)
         run = self.dt * command[INDEX["frequency"]]
         clock = clock + run
-        step = (action, pose + self.joint_scale * action, clock - clock.floor())
+        targets = pose + self.joint_scale * action
+        if self.reach is not None:
+            targets = targets.clamp(self.reach[0], self.reach[1])
+        step = (action, targets, clock - clock.floor())
         return (*step, cycles + run) if self.counted else step
 
     def _gait(self, command: Tensor) -> Tensor:
@@ -327,7 +346,14 @@ class HighLevel(nn.Module):
             *_BODY,
             Signal("last_decision", NUM_ACTIONS, "1", "the last", "decision", "decision", 0.0),
             Signal("last_commands", NUM_COMMANDS, None, "the last", "commands", "commands", start),
-            Signal("clock", 1, "1", "the low level's in its coming step"),
+            Signal(
+                "clock",
+                1,
+                "1",
+                "the low level's in its coming step",
+                start=0.0,
+                source="low.next_clock",
+            ),
             *(cues[name] for name, _ in high_layout(config.cues) if name in cues),
             Signal("hidden", hidden, "1", "state of the LSTM", None, "next_hidden", 0.0),
             Signal("cell", hidden, "1", "cell of the LSTM", None, "next_cell", 0.0),
@@ -406,66 +432,122 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
     return Pair(low_policy, low_config, *load_high(high, low_policy, low_config))
 
 
-def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, dict[str, Any]]:
-    """What the two interface files say, by level."""
-    robot, physics = pair.low_config.robot, pair.low_config.physics
-    low_table = _signals(pair.low, low) | {
-        "rate_hz": 1.0 / physics.control_dt,
+def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
+    """What the two interface files say, by graph; ``tdgc.deployment`` has their schema."""
+    config, task = pair.low_config, pair.high_config
+    robot, physics = config.robot, config.physics
+    geometry, pose = read_geometry(robot), nominal_pose(robot)
+    feet, _ = foot_kinematics(geometry, pose[None], np.zeros((1, NUM_JOINTS)))
+    urdf = urdf_path(robot)
+    joint_hz = 1.0 / (physics.dt * getattr(physics, "hold", 1))
+    gaits = [
+        {"name": gait, **dict(zip(NAMES[12:], row, strict=True))}
+        for gait, row in zip(GAITS, GAIT_TABLE.tolist(), strict=True)
+    ]
+    low_table = _head("low", pair.low, low, 1.0 / physics.control_dt) | {
         "joints": JOINTS,
-        "commands": _commands(pair.low_config.commands),
+        "commands": _commands(config.commands),
+        "gaits": gaits,
         "feet": FEET,
-        "gaits": {
-            gait: dict(zip(NAMES[12:], row, strict=True))
-            for gait, row in zip(GAITS, GAIT_TABLE.tolist(), strict=True)
+        "frames": {
+            "trunk": "ahead, left, up",
+            "gravity_when_level": _quantity("1", [0.0, 0.0, -1.0]),
+        },
+        "robot": {
+            "urdf": {"file": urdf.name, "sha256": checksum(urdf)},
+            "link_masses": _quantity("kg", geometry.masses),
+            "total_mass": _quantity("kg", sum(geometry.masses.values())),
+            "standing_height": _quantity("m", robot.base_height),
+        },
+        "start": {
+            "joint_angles": _quantity("rad", pose.tolist()),
+            "trunk_height": _quantity("m", geometry.foot_radius - float(feet[0, :, 2].min())),
         },
         "joint_control": {
             "law": "torque = kp (target - angle) - kd speed, within the torque limit; 0 where it "
             "would drive a joint beyond its speed limit",
             "axes": "right-handed: hips about the axis ahead, thighs and calves about the one to "
             "the left; at 0 a leg is straight down",
-            "rate_hz": 1.0 / physics.dt,
-            "kp": {"unit": "N m/rad", "value": [robot.kp] * NUM_JOINTS},
-            "kd": {"unit": "N m s/rad", "value": [robot.kd] * NUM_JOINTS},
-            "torque_limit": {"unit": "N m", "value": robot.torque_limit * 4},
-            "speed_limit": {"unit": "rad/s", "value": robot.speed_limit * 4},
-            "nominal_pose": {"unit": "rad", "value": nominal_pose(robot).tolist()},
+            "rate": _quantity("Hz", joint_hz),
+            "kp": _quantity("N m/rad", [robot.kp] * NUM_JOINTS),
+            "kd": _quantity("N m s/rad", [robot.kd] * NUM_JOINTS),
+            "torque_limit": _quantity("N m", robot.torque_limit * 4),
+            "speed_limit": _quantity("rad/s", robot.speed_limit * 4),
+            "simulated_speed_limit": _quantity("rad/s", [min(robot.speed_limit)] * NUM_JOINTS),
+            "joint_limits": {
+                "unit": "rad",
+                "low": geometry.joint_limits[:, 0].tolist(),
+                "high": geometry.joint_limits[:, 1].tolist(),
+            },
+            "target_margin": _quantity("rad", _target_margin(robot)),
         },
     }
-    decimation = pair.high_config.decimation
-    high_table = _signals(pair.high, high) | {
-        "rate_hz": 1.0 / (decimation * physics.control_dt),
-        "control_steps": decimation,
+    step = task.decimation * physics.control_dt
+    high_table = _head("high", pair.high, high, 1.0 / step) | {
+        "order": [{"graph": "high", "every": task.decimation}, {"graph": "low", "every": 1}],
         "joints": JOINTS,
-        "commands": _commands(pair.high_config.commands),
+        "commands": _commands(task.commands),
+        "gaits": gaits,
         "decision": (*CONTINUOUS, "gait"),
         "families": SEMANTIC,
-        "probes": {"unit": "m", "ahead_left": PROBES.tolist()},
+        "probes": {
+            "ahead_left": _quantity("m", PROBES.tolist()),
+            "plane_below_trunk": _quantity("m", robot.base_height),
+            "range": _quantity("m", PROBE_RANGE),
+            "off_map": "nearest border",
+        },
+        "task": {
+            "goal_radius": _quantity("m", GOAL_RADIUS),
+            "horizon": _quantity("s", round(task.episode_seconds / step) * step),
+            "family": {"scope": "whole tile", "otherwise": SEMANTIC[-1]},
+            "after_goal": {
+                "keep_deciding": _quantity("s", round(task.hold_seconds / step) * step),
+                "then": "stand",
+            },
+            "after_horizon": "stand",
+            "stand": {"order": "commands", "value": default_command().tolist()},
+        },
     }
     return {"low": low_table, "high": high_table}
 
 
-def _signals(policy: Policy, level: LowLevel | HighLevel) -> dict[str, Any]:
-    def table(signal: Signal) -> dict[str, Any]:
-        said = {k: v for k, v in dataclasses.asdict(signal).items() if v is not None}
+def _quantity(unit: str, value: Any) -> Table:
+    return {"unit": unit, "value": value}
+
+
+def _head(name: str, policy: Policy, level: LowLevel | HighLevel, rate: float) -> Table:
+    """What both interface files begin with."""
+
+    def table(signal: Signal) -> Table:
+        said = dataclasses.asdict(signal)
         form = {"shape": [said.pop("size")], "type": "float64"}
         return {"name": said.pop("name")} | form | said
 
     return {
+        "version": VERSION,
+        "graph": name,
         "package": f"tdgc {__version__}",
         "policy": {k: v for k, v in policy.meta.items() if k not in ("config", "low")},
+        "normalisation": "inside",
+        "rate": _quantity("Hz", rate),
         "inputs": [table(s) for s in level.inputs],
         "outputs": [table(s) for s in level.outputs],
     }
 
 
-def _commands(ranges: CommandRanges) -> list[dict[str, Any]]:
+def _commands(ranges: CommandRanges) -> list[Table]:
+    """Name, unit and bounds of each command, in order; of the embedding its two values."""
     bounds = CommandDecoder(ranges)
-    columns = zip(NAMES, UNITS, bounds.low.tolist(), bounds.high.tolist(), strict=True)
-    return [dict(zip(("name", "unit", "low", "high"), row, strict=True)) for row in columns]
+    rows = zip(NAMES, UNITS, bounds.low.tolist(), bounds.high.tolist(), strict=True)
+    return [
+        {"name": name, "unit": unit}
+        | ({"low": low, "high": high} if name in CONTINUOUS else {"values": [low, high]})
+        for name, unit, low, high in rows
+    ]
 
 
 def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
-    """Write graphs and interface files of both levels into ``folder``, which exists.
+    """Write graphs and interface files of both levels and the URDF into ``folder``, which exists.
 
     Raises:
         OSError: a file cannot be written.
@@ -475,14 +557,17 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
     tables = interfaces(pair, low, high)
     for name, level in (("low", low), ("high", high)):
         text = json.dumps(tables[name], indent=2) + "\n"
-        (folder / f"{name}_interface.json").write_text(text, encoding="utf-8")
+        interface_path(folder, name).write_text(text, encoding="utf-8")
         for form in formats:
             _write_graph(level, folder / (name + FORMATS[form]))
+    shutil.copyfile(
+        urdf_path(pair.low_config.robot), folder / tables["low"]["robot"]["urdf"]["file"]
+    )
 
 
 def _write_graph(level: LowLevel | HighLevel, path: Path) -> None:
     example = tuple(th.full((s.size,), 0.5, dtype=th.float64) for s in level.inputs)
-    with _quiet():
+    with quiet():
         if path.suffix == FORMATS["torchscript"]:
             traced = th.jit.trace(level, example)  # type: ignore[no-untyped-call]
             th.jit.save(traced, path)
@@ -499,84 +584,8 @@ def _write_graph(level: LowLevel | HighLevel, path: Path) -> None:
         )
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without what the exporters say of themselves: deprecations, operators of torchvision."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        logging.disable(logging.WARNING)
-        try:
-            yield
-        finally:
-            logging.disable(logging.NOTSET)
-
-
 # ---------------------------------------------------------------------------------------------
-# Running and checking
-
-
-class Graph:
-    """A graph from a folder that ``write`` filled, run on one thread as a robot would run it.
-
-    Attributes:
-        memory: values of the inputs that come from the step before, by name.
-        seconds: CPU time of the last step, which is its latency on a core of its own.
-    """
-
-    def __init__(self, folder: Path, name: str, form: str) -> None:
-        table = json.loads((folder / f"{name}_interface.json").read_text(encoding="utf-8"))
-        self._inputs = [s["name"] for s in table["inputs"]]
-        self._outputs = [s["name"] for s in table["outputs"]]
-        self._kept = {s["name"]: s["previous"] for s in table["inputs"] if "previous" in s}
-        self._start = {
-            s["name"]: np.full(s["shape"], s["start"]) for s in table["inputs"] if "start" in s
-        }
-        self._run = _RUNTIMES[form](folder / (name + FORMATS[form]), self._inputs)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin a new episode."""
-        self.memory, self.seconds = dict(self._start), 0.0
-
-    def __call__(self, values: dict[str, Array]) -> dict[str, Array]:
-        """One step, inputs by name -> outputs by name; what else ``values`` holds does not matter.
-
-        Inputs that come from the step before are in ``memory`` unless given.
-        """
-        known = self.memory | values
-        inputs = [known[name] for name in self._inputs]
-        started = time.thread_time()
-        outputs = self._run(inputs)
-        self.seconds = time.thread_time() - started
-        known |= dict(zip(self._outputs, outputs, strict=True))
-        self.memory = {name: known[source] for name, source in self._kept.items()}
-        return {name: known[name] for name in self._outputs}
-
-
-Run = Callable[[list[Array]], list[Array]]
-
-
-def _open_onnx(path: Path, inputs: list[str]) -> Run:
-    import onnxruntime  # type: ignore[import-untyped]
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    return lambda values: session.run(None, dict(zip(inputs, values, strict=True)))
-
-
-def _open_torchscript(path: Path, inputs: list[str]) -> Run:
-    with _quiet():
-        module = th.jit.load(path)  # type: ignore[no-untyped-call]
-
-    def run(values: list[Array]) -> list[Array]:
-        with th.inference_mode():
-            return [out.numpy() for out in module(*map(th.from_numpy, values))]
-
-    return run
-
-
-_RUNTIMES = {"onnx": _open_onnx, "torchscript": _open_torchscript}
+# Checking
 
 
 @dataclass(frozen=True)
@@ -596,8 +605,10 @@ class Check:
 def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     """Let the graphs in ``folder`` drive a robot for as long as an episode, policies beside them.
 
-    The policies see the robot through the simulator's own observation, with their own clock and
-    LSTM state. A robot that falls or leaves its tile starts anew.
+    What drives is read from the folder alone: start, sensors, probes, task and joint control. The
+    policies see the same robot through the simulator's own observation, with their own
+    configurations, clock and LSTM state. A robot that falls, leaves its tile or reaches its goal
+    starts again.
 
     Args:
         folder: where ``write`` wrote.
@@ -605,68 +616,56 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
         low, high: the policies' paths.
 
     Raises:
-        ValueError: policies that cannot be used.
+        ValueError: policies or a folder that cannot be used.
     """
-    pair = load_pair(low, high)
+    pair, controller = load_pair(low, high), Controller(folder, form)
     config, limit = pair.high_config, pair.low_config.robot.action_limit
-    decide, walk = Graph(folder, "high", form), Graph(folder, "low", form)
-    task = NavigationTask(config, low, 1, seed=0, training=False)
-    loco, robot = task.locomotion, np.arange(1)
+    decoder = CommandDecoder(config.commands, config.action_limit)
+    field, rng = TileField((1, 1)), np.random.default_rng(0)
+    field.place(0, 0, make_tile(_CHECKED_ON, 0.5, rng))
+    start, goal = field.starts[0], field.goals[0]
+    physics = dataclasses.replace(pair.low_config.physics, control_dt=controller.dt)
+    world = World(1, controller.robot(urdf_path(pair.low_config.robot)), physics, field)
+    loco = Locomotion(
+        1, pair.low_config.robot, pair.low_config.physics, field, pair.low_config.gyro, world=world
+    )
+    told = np.array([SEMANTIC.index(_CHECKED_ON)])
     differences: list[Array] = []
     seconds: list[float] = []
-    ended = np.ones(1, dtype=bool)
+    step = horizon = round(config.episode_seconds / pair.low_config.physics.control_dt)
     try:
-        for _ in range(task.horizon):
-            if ended[0]:
-                task.reset(robot)
-                decide.reset()
-                walk.reset()
-                walk.memory["clock"] = loco.clock.clock
-                loco.command[:] = decide.memory["last_commands"]
-                state, last = None, np.zeros((1, NUM_ACTIONS), dtype=np.float32)
-            # A new episode has the phases of the one before until its first step.
-            loco.clock.update(loco.command[:, 12:], loco.command[:, INDEX["duration"]])
-            share, family = task.elapsed / task.horizon, task.family_index
-            seen = observe_high(
-                loco, task.goal, share, task.decoder.normalise(last), family, config.cues
+        for _ in range(horizon):
+            x, y = world.state.position[:, 0], world.state.position[:, 1]
+            over = is_fallen(world) | ~field.on_tile(0, 0, x, y)
+            if step == horizon or over[0] or np.hypot(*(goal[0] - [x[0], y[0]])) < GOAL_RADIUS:
+                controller.reset()
+                loco.command[:] = default_command()
+                loco.place(np.arange(1), start[:, :2], start[:, 2], np.zeros(1))
+                controller.place(world, start[0])
+                step, state, last = 0, None, np.zeros((1, NUM_ACTIONS), dtype=np.float32)
+            targets = controller.step(
+                controller.sense(world.state, goal[0], _CHECKED_ON, field.height_at)
             )
-            last, state = pair.high.predict(seen, state)
-            made = decide(_sense(task) | {"clock": walk.memory["clock"]})
-            differences += [
-                made["decision"] - last[0],
-                made["commands"] - task.decoder.decode(made["decision"]),
-            ]
-            loco.command[:] = made["commands"]
-            task.elapsed += 1
-            for k in range(config.decimation):
-                action = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
-                targets = joint_targets(loco.robot, loco.pose(), action.astype(np.float64))
-                step = walk(_sense(task) | {"commands": made["commands"]})
-                seconds.append(walk.seconds + (decide.seconds if k == 0 else 0.0))
-                differences += [step["action"] - action[0], step["joint_targets"] - targets[0]]
-                loco.act(step["action"][None])
-            x, y = loco.world.state.position[:, 0], loco.world.state.position[:, 1]
-            ended = is_fallen(loco.world) | ~task.field.on_tile(robot, 0, x, y)
+            made, decided = controller.low.values, controller.high.values
+            if step % config.decimation == 0:
+                # A new episode has the phases of the one before until its first step.
+                loco.clock.update(loco.command[:, 12:], loco.command[:, INDEX["duration"]])
+                share = np.full(1, step / horizon)
+                seen = observe_high(loco, goal, share, decoder.normalise(last), told, config.cues)
+                last, state = pair.high.predict(seen, state)
+                differences += [
+                    decided["decision"] - last[0],
+                    controller.commands - decoder.decode(decided["decision"]),
+                ]
+            loco.command[:] = controller.commands
+            action = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
+            loco.act(made["action"][None])
+            differences += [made["action"] - action[0], targets - loco.targets[0, 0]]
+            seconds.append(controller.seconds)
+            step += 1
     finally:
-        task.close()
+        world.close()
     return Check(float(np.abs(np.concatenate(differences)).max()), np.array(seconds))
-
-
-def _sense(task: NavigationTask) -> dict[str, Array]:
-    """What the task's one robot would know by its sensors and its map."""
-    loco, state = task.locomotion, task.locomotion.world.state
-    ahead, left = np.cos(state.yaw[0]), np.sin(state.yaw[0])
-    offset = task.goal[0] - state.position[0, :2]
-    return {
-        "gravity": state.gravity[0],
-        "joint_angles": state.q[0] - loco.joint_offset[0],
-        "joint_speeds": state.qd[0],
-        "gyro": state.rotation[0].T @ state.ang_vel[0],
-        "goal": np.array([[ahead, left], [-left, ahead]]) @ offset,
-        "time_left": (task.horizon - task.elapsed) * task.step_seconds,
-        "family": np.eye(len(SEMANTIC))[task.family_index[0]],
-        "probes": height_probes(loco)[0],
-    }
 
 
 def _choose_formats(text: str) -> list[str]:
@@ -674,12 +673,7 @@ def _choose_formats(text: str) -> list[str]:
     for name in names:
         if name not in FORMATS:
             raise ValueError(f"unknown format '{name}'; allowed: {', '.join(FORMATS)}")
-    missing = [name for name in _ONNX_PACKAGES if importlib.util.find_spec(name) is None]
-    if "onnx" in names and missing:
-        raise ValueError(
-            f"format onnx needs {', '.join(missing)}: {install_hint('export')}, "
-            "or use --format torchscript"
-        )
+    require(_PACKAGES if "onnx" in names else _PACKAGES[:1], "export")
     return names
 
 

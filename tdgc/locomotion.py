@@ -92,6 +92,8 @@ def action_mirror() -> tuple[NDArray[np.int64], NDArray[np.float32]]:
 class Locomotion:
     """M robots that take 12 actions each 20 ms and follow 15 commands.
 
+    They are in a new Bullet world, or in ``world`` if there is one.
+
     Attributes:
         command: (M, 15), to be set by the caller.
         actions: (2, M, 12), the last clipped action and the one before.
@@ -107,12 +109,13 @@ class Locomotion:
         field: TileField | None,
         gyro: bool = False,
         visual: bool = False,
+        world: World | None = None,
     ) -> None:
         self.num_robots = num_robots
         self.robot = robot
         self.physics = physics
         self.gyro = gyro
-        self.world = World(num_robots, robot, physics, field, visual)
+        self.world = world or World(num_robots, robot, physics, field, visual)
         self.clock = PhaseClock(num_robots)
         self.nominal = nominal_pose(robot)
         self.command = np.tile(default_command(), (num_robots, 1))
