@@ -22,13 +22,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tdgc import cluster, diagnosis, film, gui, plots, report, tuning
-from tdgc.cluster import CLUSTER_HELP
-from tdgc.config import ConfigError, LowLevelConfig
-from tdgc.cores import usable_cores, workers_flag
-from tdgc.diagnosis import Diagnosis, diagnose
-from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
-from tdgc.evaluation import (
+from tdgc.benchmark import diagnosis, tuning
+from tdgc.benchmark.diagnosis import Diagnosis, diagnose
+from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
+from tdgc.benchmark.evaluation import (
     CONDITIONS,
     Cell,
     Episode,
@@ -39,16 +36,21 @@ from tdgc.evaluation import (
     tracking,
     write_results,
 )
-from tdgc.geometry import read_geometry
-from tdgc.high_env import PRETRAINED, load_low
+from tdgc.benchmark.recording import Recorder, Recording, Together
+from tdgc.benchmark.trace import Selection, Trace, Tracer, check_installed, write
+from tdgc.benchmark.tuning import TunedDriver, Tuning
+from tdgc.config import ConfigError, LowLevelConfig
+from tdgc.parallel import cluster
+from tdgc.parallel.cluster import CLUSTER_HELP
+from tdgc.parallel.cores import usable_cores, workers_flag
+from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Policy
-from tdgc.recording import Recorder, Recording, Together
-from tdgc.teacher import STYLES
-from tdgc.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
-from tdgc.trace import Selection, Trace, Tracer, check_installed, write
-from tdgc.tuning import TunedDriver, Tuning
-from tdgc.worker import WorkerError
-from tdgc.world import WindowError
+from tdgc.show import film, gui, plots, report
+from tdgc.sim.geometry import read_geometry
+from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
+from tdgc.sim.world import WindowError
+from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.teacher import STYLES
 
 POLICIES = ("tdgc", "gp")
 TEACHER = "teacher"

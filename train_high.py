@@ -18,19 +18,20 @@ from typing import Any, cast
 
 import torch as th
 
-from tdgc import __version__, plots
-from tdgc.commands import INDEX, CommandDecoder, default_command
+from tdgc import __version__
 from tdgc.config import PRESETS, ConfigError, HighTrainConfig, to_dict
-from tdgc.high_env import NavigationTask, check_pair, load_low, summarise
-from tdgc.imitation import Apprentice, ApprenticePolicy
-from tdgc.leaps import LANDING, measure_landing
+from tdgc.learn.imitation import Apprentice, ApprenticePolicy
+from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.learn.training import Phase, add_arguments, configure, run
+from tdgc.parallel.vec import TaskVecEnv
+from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import Policy
-from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
-from tdgc.teacher import check_styles
-from tdgc.tiles import check_families
-from tdgc.training import Phase, add_arguments, configure, run
-from tdgc.vec import TaskVecEnv
-from tdgc.worker import MakeLink, WorkerError
+from tdgc.show import plots
+from tdgc.sim.commands import INDEX, CommandDecoder, default_command
+from tdgc.tasks.high_env import NavigationTask, check_pair, load_low, summarise
+from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.teacher import check_styles
+from tdgc.tasks.tiles import check_families
 
 
 def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
@@ -62,9 +63,9 @@ def build(
         env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
     probe = NavigationTask(env_config, low, 1, seed=0, guided=guided)
     spaces = probe.observation_space, probe.action_space
-    landing = LANDING
+    landing = None
     if guided and "gap" in env_config.families:
-        landing = measure_landing(low, probe.low_config, env_config.decimation)
+        landing = measure_landing(low, probe.low_config)
     probe.close()
     env = TaskVecEnv(
         functools.partial(NavigationTask, env_config, low, guided=guided, landing=landing),

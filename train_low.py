@@ -16,18 +16,19 @@ import sys
 import torch as th
 from stable_baselines3 import PPO
 
-from tdgc import __version__, plots, policies
+from tdgc import __version__, policies
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, to_dict
-from tdgc.low_env import LowLevelTask, make_task, summarise
+from tdgc.learn.training import Phase, add_arguments, configure, run
+from tdgc.parallel.vec import TaskVecEnv
+from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
-from tdgc.tiles import check_families
-from tdgc.training import Phase, add_arguments, configure, run
-from tdgc.vec import TaskVecEnv
-from tdgc.worker import MakeLink, WorkerError
+from tdgc.show import plots
+from tdgc.tasks.low_env import LowLevelTask, make_task, summarise
+from tdgc.tasks.tiles import check_families
 
 
 def phases(config: LowTrainConfig, device: str) -> list[Phase]:
-    """First the plane for all, then tiles whose levels rise with success for most.
+    """Robots on a plane and on tiles whose levels rise with success.
 
     Raises:
         ConfigError: a share of the robots that is none.
@@ -35,13 +36,12 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
     if not 0.0 <= config.plane_share < 1.0:
         raise ConfigError(f"'plane_share' must be from 0 to below 1, not {config.plane_share:g}")
     env = config.env
-    physics = dataclasses.replace(env.physics, substeps=config.plane_substeps)
+    # A plane lets nothing sink, so there a physics step may be as long as a torque is held.
+    steps = env.physics.joint_steps
+    physics = dataclasses.replace(env.physics, substeps=steps, hold=1)
     plane = dataclasses.replace(env, terrain="plane", physics=physics)
     tiles = dataclasses.replace(env, terrain="tiles")
-    return [
-        Phase(functools.partial(build, config, others, device), min(until, config.steps))
-        for others, until in (((plane, plane), config.plane_steps), ((plane, tiles), config.steps))
-    ]
+    return [Phase(functools.partial(build, config, (plane, tiles), device), config.steps)]
 
 
 def build(

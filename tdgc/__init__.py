@@ -9,8 +9,8 @@ __version__ = "0.1.0"
 
 #: Gymnasium id -> where its class is; the module is imported when an environment is made.
 ENVIRONMENTS = {
-    "tdgc/LowLevel-v0": "tdgc.low_env:LowLevelEnv",
-    "tdgc/Navigation-v0": "tdgc.high_env:NavigationEnv",
+    "tdgc/LowLevel-v0": "tdgc.tasks.low_env:LowLevelEnv",
+    "tdgc/Navigation-v0": "tdgc.tasks.high_env:NavigationEnv",
 }
 
 for _id, _entry_point in ENVIRONMENTS.items():

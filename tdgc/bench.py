@@ -35,17 +35,17 @@ from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.logger import Logger
 
-from tdgc.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
-from tdgc.cores import auto_workers, usable_cores, workers_flag
 from tdgc.errors import InputError
-from tdgc.high_env import NavigationTask
-from tdgc.low_env import LowLevelTask
+from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
+from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
+from tdgc.parallel.vec import TaskVecEnv
+from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, Mirror
-from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
-from tdgc.robot import NUM_JOINTS
-from tdgc.vec import TaskVecEnv
-from tdgc.worker import MakeLink, ProcessLink, memory_mb
+from tdgc.sim.robot import NUM_JOINTS
+from tdgc.tasks.high_env import NavigationTask
+from tdgc.tasks.low_env import LowLevelTask
 
 _COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
 UPDATES = 80  # turns of ``--update``: other work shares the cores

@@ -25,24 +25,24 @@ import torch as th
 from torch import nn
 
 from tdgc import policies
-from tdgc.commands import CONTINUOUS, NUM_COMMANDS, commands_of, observed_command
+from tdgc.benchmark.evaluation import draw_commands, spread, walk_on_plane
 from tdgc.config import CommandRanges, LowLevelConfig
-from tdgc.cores import auto_workers, usable_cores, workers_flag
-from tdgc.evaluation import draw_commands, spread, walk_on_plane
-from tdgc.gaits import GAITS
-from tdgc.group import TaskGroup
-from tdgc.high_env import load_low
-from tdgc.locomotion import ACTOR_LAYOUT, MIRRORS
-from tdgc.low_env import LowLevelTask, is_fallen, make_task
+from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
+from tdgc.parallel.group import TaskGroup
+from tdgc.parallel.vec import TaskVecEnv
+from tdgc.parallel.worker import Task, WorkerError
 from tdgc.policies import Actor, Policy
-from tdgc.robot import Array
-from tdgc.vec import TaskVecEnv
-from tdgc.worker import Task, WorkerError
+from tdgc.sim.commands import CONTINUOUS, NUM_COMMANDS, commands_of, observed_command
+from tdgc.sim.gaits import GAITS
+from tdgc.sim.locomotion import ACTOR_LAYOUT, MIRRORS
+from tdgc.sim.robot import Array
+from tdgc.tasks.high_env import load_low
+from tdgc.tasks.low_env import LowLevelTask, is_fallen, make_task
 
 #: From the commands asked for to those given, (n, 15) -> (n, 15).
 Correction = Callable[[Array], Array]
 
-_STREAM = 3  # of random numbers, apart from those of training and evaluation (``tdgc.terrain``)
+_STREAM = 3  # of random numbers, apart from those of training and evaluation (``tdgc.sim.terrain``)
 _BATCH = 400  # robots that walk at a time
 _WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2  # the mean is over the rest
 # Of the velocity ranges, in which responses are measured and to which commands may be corrected:

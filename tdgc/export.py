@@ -7,7 +7,7 @@ A graph holds all that stands between a robot's sensors and its joint targets: o
 ``low.pt`` stands ``low_interface.json``, which says what goes in and comes out, in which order and
 unit, and how the joints are driven; likewise for ``high``, with the task. The robot's URDF is there
 too. Afterwards each pair of graphs drives a robot in the simulator for as long as an episode, from
-the folder alone (``tdgc.deployment``), and its outputs are compared with the policies'.
+the folder alone (``tdgc.deploy``), and its outputs are compared with the policies'.
 
 All inputs and outputs are vectors of float64. The networks run in float32, as they were trained;
 what surrounds them runs in float64, as in the simulator: a clock in float32 would drift away.
@@ -31,7 +31,20 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from tdgc import __version__
-from tdgc.commands import (
+from tdgc.benchmark.drivers import load_high
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
+from tdgc.deploy.controller import (
+    FORMATS,
+    VERSION,
+    Controller,
+    Table,
+    checksum,
+    interface_path,
+    quiet,
+    require,
+)
+from tdgc.policies import Policy
+from tdgc.sim.commands import (
     CONTINUOUS,
     INDEX,
     NAMES,
@@ -42,21 +55,21 @@ from tdgc.commands import (
     default_command,
     observed_command,
 )
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
-from tdgc.deployment import (
-    FORMATS,
-    VERSION,
-    Controller,
-    Table,
-    checksum,
-    interface_path,
-    quiet,
-    require,
+from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
+from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
+from tdgc.sim.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE, Locomotion
+from tdgc.sim.robot import (
+    HIGHEST_FOOT,
+    NUM_JOINTS,
+    Array,
+    action_scale,
+    foot_kinematics,
+    nominal_pose,
+    target_limits,
 )
-from tdgc.drivers import load_high
-from tdgc.gaits import FEET, GAIT_TABLE, GAITS
-from tdgc.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
-from tdgc.high_env import (
+from tdgc.sim.terrain import TileField, make_tile
+from tdgc.sim.world import World
+from tdgc.tasks.high_env import (
     GOAL_SCALE,
     PRETRAINED,
     PROBE_RANGE,
@@ -66,12 +79,7 @@ from tdgc.high_env import (
     load_low,
     observe_high,
 )
-from tdgc.locomotion import ACTOR_LAYOUT, GYRO_LAYOUT, GYRO_SCALE, SPEED_SCALE, Locomotion
-from tdgc.low_env import GOAL_RADIUS, is_fallen
-from tdgc.policies import Policy
-from tdgc.robot import HIGHEST_FOOT, NUM_JOINTS, Array, foot_kinematics, nominal_pose
-from tdgc.terrain import TileField, make_tile
-from tdgc.world import World
+from tdgc.tasks.low_env import GOAL_RADIUS, is_fallen
 
 #: Largest difference allowed between graphs and policies, in the units of the outputs: float32
 #: networks of this size differ by about 1e-6 where two libraries add up in another order.
@@ -126,12 +134,6 @@ _BODY = (
     Signal("joint_speeds", NUM_JOINTS, "rad/s", "measured speeds", "joints"),
 )
 _GYRO = Signal("gyro", 3, "rad/s", "angular velocity about the trunk's axes: ahead, left, up")
-
-
-def _target_margin(robot: RobotConfig) -> float | None:
-    """rad that joint targets keep from the joint limits; None where they run past them."""
-    margin: float | None = getattr(robot, "joint_margin", None)
-    return margin
 
 
 class ClippedActor(nn.Module):
@@ -224,10 +226,9 @@ class LowLevel(nn.Module):
         self.least = _constant(robot.start_frequency)
         self.counted = ramped or hurried
         self.is_frequency = _constant(np.arange(NUM_COMMANDS) == INDEX["frequency"])
-        self.joint_scale = _constant(robot.action_scale * np.tile([robot.hip_scale, 1.0, 1.0], 4))
-        margin = _target_margin(robot)
-        limits = read_geometry(robot).joint_limits.T
-        self.reach = None if margin is None else _constant(limits + [[margin], [-margin]])
+        self.joint_scale = _constant(action_scale(robot))
+        lowest, highest = target_limits(robot, read_geometry(robot))
+        self.lowest, self.highest = _constant(lowest), _constant(highest)
         # This map is affine, so its values at 0 and at 1 say all.
         zero = observed_command(np.zeros(NUM_COMMANDS))
         self.command_zero = _constant(zero)
@@ -295,9 +296,7 @@ class LowLevel(nn.Module):
         action = self.actor(th.cat(parts).float()).double().clamp(-self.limit, self.limit)
         run = self.dt * command[INDEX["frequency"]]
         clock = clock + run
-        targets = pose + self.joint_scale * action
-        if self.reach is not None:
-            targets = targets.clamp(self.reach[0], self.reach[1])
+        targets = (pose + self.joint_scale * action).clamp(self.lowest, self.highest)
         step = (action, targets, clock - clock.floor())
         return (*step, cycles + run) if self.counted else step
 
@@ -433,13 +432,13 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
 
 
 def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
-    """What the two interface files say, by graph; ``tdgc.deployment`` has their schema."""
+    """What the two interface files say, by graph; ``tdgc.deploy`` has their schema."""
     config, task = pair.low_config, pair.high_config
     robot, physics = config.robot, config.physics
     geometry, pose = read_geometry(robot), nominal_pose(robot)
     feet, _ = foot_kinematics(geometry, pose[None], np.zeros((1, NUM_JOINTS)))
     urdf = urdf_path(robot)
-    joint_hz = 1.0 / (physics.dt * getattr(physics, "hold", 1))
+    joint_hz = physics.joint_steps / physics.control_dt
     gaits = [
         {"name": gait, **dict(zip(NAMES[12:], row, strict=True))}
         for gait, row in zip(GAITS, GAIT_TABLE.tolist(), strict=True)
@@ -479,7 +478,7 @@ def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
                 "low": geometry.joint_limits[:, 0].tolist(),
                 "high": geometry.joint_limits[:, 1].tolist(),
             },
-            "target_margin": _quantity("rad", _target_margin(robot)),
+            "target_margin": _quantity("rad", robot.joint_margin),
         },
     }
     step = task.decimation * physics.control_dt

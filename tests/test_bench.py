@@ -14,9 +14,9 @@ from sb3_contrib import RecurrentPPO
 
 from tdgc import bench
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
-from tdgc.low_env import LowLevelTask
-from tdgc.recurrent import FastRecurrentPPO
-from tdgc.vec import TaskVecEnv
+from tdgc.learn.recurrent import FastRecurrentPPO
+from tdgc.parallel.vec import TaskVecEnv
+from tdgc.tasks.low_env import LowLevelTask
 
 
 def test_robots_are_spread_over_the_levels() -> None:

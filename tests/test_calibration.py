@@ -11,14 +11,14 @@ from gymnasium import spaces
 
 from tdgc import calibration, policies
 from tdgc.calibration import Corrector, ResponseModel, distil, measure, training_tasks
-from tdgc.commands import INDEX, commands_of, observed_command
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
-from tdgc.gaits import GAITS, gait_embedding
-from tdgc.locomotion import ACTOR_LAYOUT, MIRRORS, action_mirror, mirror_map
-from tdgc.low_env import LowLevelTask
+from tdgc.parallel.vec import TaskVecEnv
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
-from tdgc.robot import Array
-from tdgc.vec import TaskVecEnv
+from tdgc.sim.commands import INDEX, commands_of, observed_command
+from tdgc.sim.gaits import GAITS, gait_embedding
+from tdgc.sim.locomotion import ACTOR_LAYOUT, MIRRORS, action_mirror, mirror_map
+from tdgc.sim.robot import Array
+from tdgc.tasks.low_env import LowLevelTask
 
 RANGES = CommandRanges()
 HALF = np.array([1.0, 0.6, 1.0])  # of the velocity ranges

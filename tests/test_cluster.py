@@ -22,11 +22,12 @@ import evaluate
 import tdgc
 import train_high
 import train_low
-from tdgc import bench, cluster
-from tdgc.cluster import ActorLink, ClusterError, connect
-from tdgc.training import Interruption
-from tdgc.vec import TaskVecEnv, worker_seed
-from tdgc.worker import WorkerError
+from tdgc import bench
+from tdgc.learn.training import Interruption
+from tdgc.parallel import cluster
+from tdgc.parallel.cluster import ActorLink, ClusterError, connect
+from tdgc.parallel.vec import TaskVecEnv, worker_seed
+from tdgc.parallel.worker import WorkerError
 
 TESTS = Path(__file__).resolve().parent
 

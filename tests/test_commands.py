@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tdgc.commands import (
+from tdgc.config import CommandRanges
+from tdgc.sim.commands import (
     CONTINUOUS,
     INDEX,
     NAMES,
@@ -15,8 +16,7 @@ from tdgc.commands import (
     gait_index,
     observed_command,
 )
-from tdgc.config import CommandRanges
-from tdgc.gaits import gait_embedding
+from tdgc.sim.gaits import gait_embedding
 
 #: name, unit, and the command at x = -1, 0 and 1.
 CHANNELS = [

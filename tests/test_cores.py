@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tdgc.cores import auto_workers, usable_cores, workers_flag
+from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 
 
 @pytest.mark.parametrize(

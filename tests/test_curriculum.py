@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tdgc.curriculum import Curriculum, update_level
+from tdgc.tasks.curriculum import Curriculum, update_level
 
 W, S, LEVELS = 10, 8, 11  # promoted at 8 or more of 10, demoted at 2 or fewer
 

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tdgc import diagnosis, drivers
-from tdgc.commands import INDEX
-from tdgc.diagnosis import LIMITS, Diagnosis, describe, diagnose, features, place_of
-from tdgc.drivers import HierarchyDriver, load_high
-from tdgc.evaluation import Cell, Episode, run_cell, tile_of
-from tdgc.high_env import PRETRAINED, PROBES, load_low
-from tdgc.locomotion import Locomotion
-from tdgc.robot import Array
-from tdgc.trace import COLUMNS, Trace, Tracer
+from tdgc.benchmark import diagnosis, drivers
+from tdgc.benchmark.diagnosis import LIMITS, Diagnosis, describe, diagnose, features, place_of
+from tdgc.benchmark.drivers import HierarchyDriver, load_high
+from tdgc.benchmark.evaluation import Cell, Episode, run_cell, tile_of
+from tdgc.benchmark.trace import COLUMNS, Trace, Tracer
+from tdgc.sim.commands import INDEX
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.tasks.high_env import PRETRAINED, PROBES, load_low
 
 HIPS = 0.183  # m, of the shipped robot
 

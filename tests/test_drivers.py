@@ -13,7 +13,13 @@ import torch as th
 from gymnasium import spaces
 
 from tdgc import policies
-from tdgc.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
+from tdgc.benchmark.drivers import (
+    BaselineDriver,
+    GoToGoal,
+    HierarchyDriver,
+    TeacherDriver,
+    load_high,
+)
 from tdgc.config import (
     CommandRanges,
     ConfigError,
@@ -23,13 +29,20 @@ from tdgc.config import (
     RandomisationConfig,
     to_dict,
 )
-from tdgc.drivers import BaselineDriver, GoToGoal, HierarchyDriver, TeacherDriver, load_high
-from tdgc.high_env import PRETRAINED, SEMANTIC, NavigationTask, high_layout, load_low, observe_high
-from tdgc.leaps import measure_landing
-from tdgc.locomotion import Locomotion
+from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import Policy
-from tdgc.recurrent import FastRecurrentPolicy
-from tdgc.robot import Array
+from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.tasks.high_env import (
+    PRETRAINED,
+    SEMANTIC,
+    NavigationTask,
+    high_layout,
+    load_low,
+    observe_high,
+)
+from tdgc.tasks.leaps import measure_landing
 
 LOW = PRETRAINED / "low"
 CONFIG = HighLevelConfig(randomisation=RandomisationConfig(scale=0.0))

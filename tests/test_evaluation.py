@@ -13,9 +13,9 @@ import pytest
 from test_drivers import save_high
 
 import evaluate
-from tdgc import evaluation
-from tdgc.drivers import BaselineDriver, HierarchyDriver, load_high
-from tdgc.evaluation import (
+from tdgc.benchmark import evaluation
+from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, load_high
+from tdgc.benchmark.evaluation import (
     BATCH,
     CONDITIONS,
     OUTCOMES,
@@ -31,11 +31,11 @@ from tdgc.evaluation import (
     tile_of,
     wilson_interval,
 )
-from tdgc.gaits import GAIT_TABLE, GAITS
-from tdgc.high_env import PRETRAINED, load_low
-from tdgc.locomotion import Locomotion
-from tdgc.robot import Array
-from tdgc.terrain import EVAL_STREAM, TileField, make_tile, tile_rng
+from tdgc.sim.gaits import GAIT_TABLE, GAITS
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.sim.terrain import EVAL_STREAM, TileField, make_tile, tile_rng
+from tdgc.tasks.high_env import PRETRAINED, load_low
 
 
 @pytest.fixture(scope="module")

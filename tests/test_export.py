@@ -15,12 +15,13 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from tdgc import export, policies
-from tdgc.commands import CommandDecoder
 from tdgc.config import CommandRanges, HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
 from tdgc.export import FORMATS, TOLERANCE, Graph, HighLevel, LowLevel
-from tdgc.gaits import GAIT_TABLE, PhaseClock, gait_embedding
-from tdgc.high_env import PRETRAINED, NavigationTask, high_layout, load_low, observe_high
-from tdgc.locomotion import (
+from tdgc.learn.recurrent import FastRecurrentPolicy
+from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
+from tdgc.sim.commands import CommandDecoder
+from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
+from tdgc.sim.locomotion import (
     ACTOR_LAYOUT,
     GYRO_LAYOUT,
     MIRRORS,
@@ -28,9 +29,8 @@ from tdgc.locomotion import (
     action_mirror,
     mirror_map,
 )
-from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
-from tdgc.recurrent import FastRecurrentPolicy
-from tdgc.robot import JOINTS, nominal_pose
+from tdgc.sim.robot import JOINTS, nominal_pose
+from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_layout, load_low, observe_high
 
 LOW = PRETRAINED / "low"
 LOW_POLICY, LOW_CONFIG = load_low(LOW)

@@ -16,11 +16,11 @@ import pytest
 from numpy.typing import NDArray
 
 from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
-from tdgc.low_env import LowLevelTask
-from tdgc.robot import Array
+from tdgc.parallel.vec import FAULT_STEPS, Fault, TaskVecEnv, worker_seed
+from tdgc.parallel.worker import WorkerError
+from tdgc.sim.robot import Array
 from tdgc.state import State, join, split
-from tdgc.vec import FAULT_STEPS, Fault, TaskVecEnv, worker_seed
-from tdgc.worker import WorkerError
+from tdgc.tasks.low_env import LowLevelTask
 
 # What a robot's action makes of its task.
 RAISE, DIE, HANG, NAN_SEEN, NAN_EARNED, INFINITE, FAR = range(2, 9)

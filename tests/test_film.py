@@ -15,18 +15,19 @@ import pytest
 from PIL import Image
 
 import evaluate
-from tdgc import evaluation, film, plots
-from tdgc.commands import default_command
+from tdgc.benchmark import evaluation
+from tdgc.benchmark.drivers import BaselineDriver
+from tdgc.benchmark.evaluation import Cell, run_cell, tile_of
+from tdgc.benchmark.recording import Recorder, Recording, Together, spans, stretches
 from tdgc.config import CommandRanges, RobotConfig
-from tdgc.drivers import BaselineDriver
-from tdgc.evaluation import Cell, run_cell, tile_of
-from tdgc.gaits import gait_embedding
-from tdgc.high_env import PRETRAINED, load_low
-from tdgc.locomotion import Locomotion
-from tdgc.recording import Recorder, Recording, Together, spans, stretches
-from tdgc.rewards import CONTACT_FORCE
-from tdgc.robot import Array, nominal_pose
-from tdgc.terrain import TileField
+from tdgc.show import film, plots
+from tdgc.sim.commands import default_command
+from tdgc.sim.gaits import gait_embedding
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array, nominal_pose
+from tdgc.sim.terrain import TileField
+from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.rewards import CONTACT_FORCE
 
 
 def planted(steps: int = 25, policy: str = "gp", **changes: Any) -> Recording:

@@ -33,7 +33,11 @@ from hypothesis import strategies as st
 from test_drivers import save_high
 from test_trace import same
 
-from tdgc import policies, trace, training, tuning
+from tdgc import policies
+from tdgc.benchmark import trace, tuning
+from tdgc.benchmark.drivers import load_high
+from tdgc.benchmark.trace import COLUMNS, Trace, TraceError
+from tdgc.benchmark.tuning import Tuning
 from tdgc.config import (
     ConfigError,
     HighTrainConfig,
@@ -42,13 +46,11 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.drivers import load_high
 from tdgc.errors import InputError
-from tdgc.high_env import PRETRAINED, load_low
+from tdgc.learn import training
+from tdgc.learn.training import CheckpointError
 from tdgc.policies import AsymmetricActorCriticPolicy, Header, PolicyFileError
-from tdgc.trace import COLUMNS, Trace, TraceError
-from tdgc.training import CheckpointError
-from tdgc.tuning import Tuning
+from tdgc.tasks.high_env import PRETRAINED, load_low
 
 #: The same examples in every run.
 examples = settings(deadline=None, derandomize=True, database=None, max_examples=60)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tdgc.gaits import (
+from tdgc.sim.gaits import (
     FEET,
     GAIT_TABLE,
     GAITS,

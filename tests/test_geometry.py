@@ -13,22 +13,22 @@ import torch as th
 
 import evaluate
 import train_low
-from tdgc import rewards
-from tdgc.commands import INDEX, default_command
 from tdgc.config import ConfigError, LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.export import Pose
-from tdgc.gaits import PhaseClock, swing_profile
-from tdgc.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
-from tdgc.high_env import PRETRAINED
-from tdgc.low_env import LowLevelTask
-from tdgc.robot import (
+from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.gaits import PhaseClock, swing_profile
+from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
+from tdgc.sim.robot import (
     commanded_pose,
     foot_kinematics,
     leg_angles,
     nominal_pose,
     rotation_matrix,
 )
-from tdgc.world import World
+from tdgc.sim.world import World
+from tdgc.tasks import rewards
+from tdgc.tasks.high_env import PRETRAINED
+from tdgc.tasks.low_env import LowLevelTask
 
 SHIPPED = urdf_path(RobotConfig()).read_text(encoding="utf-8")
 STILL, UPRIGHT = np.zeros((1, 12)), np.array([[0.0, 0.0, 0.0, 1.0]])

@@ -7,8 +7,8 @@ import pytest
 
 import train_low
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, PhysicsConfig
-from tdgc.group import TaskGroup
-from tdgc.low_env import LowLevelTask, make_task, summarise
+from tdgc.parallel.group import TaskGroup
+from tdgc.tasks.low_env import LowLevelTask, make_task, summarise
 
 PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4), episode_seconds=0.4)
 TILES = dataclasses.replace(PLANE, terrain="tiles", families=("stair", "rough"))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import evaluate
-from tdgc.commands import INDEX, default_command
-from tdgc.gaits import GAIT_TABLE, GAITS
-from tdgc.gui import describe, slider_command
-from tdgc.world import WindowError, check_display
+from tdgc.show.gui import describe, slider_command
+from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.gaits import GAIT_TABLE, GAITS
+from tdgc.sim.world import WindowError, check_display
 
 
 def test_sliders_are_the_commands() -> None:

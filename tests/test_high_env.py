@@ -11,9 +11,9 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import tdgc  # noqa: F401  registers the environments
-from tdgc import rewards
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, HighRewardConfig
-from tdgc.high_env import (
+from tdgc.tasks import rewards
+from tdgc.tasks.high_env import (
     PRETRAINED,
     PROBES,
     SEMANTIC,
@@ -22,7 +22,7 @@ from tdgc.high_env import (
     high_layout,
     load_low,
 )
-from tdgc.rewards import HighStep
+from tdgc.tasks.rewards import HighStep
 
 LOW = PRETRAINED / "low"
 

@@ -10,8 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from tdgc import policies
-from tdgc.commands import NUM_ACTIONS
-from tdgc.imitation import Apprentice, ApprenticePolicy
+from tdgc.learn.imitation import Apprentice, ApprenticePolicy
+from tdgc.sim.commands import NUM_ACTIONS
 
 SEEN, ENVS, STEPS = 5, 4, 16
 

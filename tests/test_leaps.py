@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tdgc.high_env import PRETRAINED, load_low
-from tdgc.leaps import LANDING, Landing, measure_landing, straddling_frequency
+from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.leaps import LANDING, Landing, measure_landing, straddling_frequency
 
 LOW = PRETRAINED / "low"
 

@@ -8,19 +8,19 @@ import numpy as np
 import pybullet
 import pytest
 
-from tdgc.commands import INDEX, observed_command
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
-from tdgc.gaits import GAITS, gait_embedding, swing_profile
-from tdgc.locomotion import (
+from tdgc.sim.commands import INDEX, observed_command
+from tdgc.sim.gaits import GAITS, gait_embedding, swing_profile
+from tdgc.sim.locomotion import (
     ACTOR_LAYOUT,
     GYRO_LAYOUT,
     SPEED_SCALE,
     Locomotion,
     action_mirror,
 )
-from tdgc.low_env import CRITIC_LAYOUT, LowLevelTask
-from tdgc.robot import Array, commanded_pose, nominal_pose
-from tdgc.terrain import TILE_SIZE, Tile, make_tile
+from tdgc.sim.robot import Array, commanded_pose, nominal_pose
+from tdgc.sim.terrain import TILE_SIZE, Tile, make_tile
+from tdgc.tasks.low_env import CRITIC_LAYOUT, LowLevelTask
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig(substeps=4)
 NOMINAL = nominal_pose(ROBOT)

@@ -13,11 +13,14 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-import tdgc.low_env as low_env
-from tdgc.commands import INDEX, default_command, gait_index
+import tdgc.tasks.low_env as low_env
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
-from tdgc.geometry import read_geometry
-from tdgc.low_env import (
+from tdgc.sim.commands import INDEX, default_command, gait_index
+from tdgc.sim.geometry import read_geometry
+from tdgc.sim.robot import Array, RobotState, nominal_pose, yaw_quaternion
+from tdgc.sim.terrain import make_tile, tile_rng
+from tdgc.state import State, split
+from tdgc.tasks.low_env import (
     CRITIC_LAYOUT,
     LowLevelEnv,
     LowLevelTask,
@@ -25,9 +28,6 @@ from tdgc.low_env import (
     shallow,
     summarise,
 )
-from tdgc.robot import Array, RobotState, nominal_pose, yaw_quaternion
-from tdgc.state import State, split
-from tdgc.terrain import make_tile, tile_rng
 
 NOMINAL = nominal_pose(RobotConfig())
 PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4))

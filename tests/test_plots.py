@@ -10,9 +10,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from tdgc import plots
-from tdgc.evaluation import Episode, tile_of, write_results
-from tdgc.robot import Array
+from tdgc.benchmark.evaluation import Episode, tile_of, write_results
+from tdgc.show import plots
+from tdgc.sim.robot import Array
 
 FAMILIES = ("rough", "gap")
 

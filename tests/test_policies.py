@@ -5,6 +5,8 @@ import json
 import os
 import pickle
 import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -558,3 +560,25 @@ def test_no_byte_can_be_changed_unseen(saved):
         if suffix == ".safetensors":
             assert survivors == 0
     assert np.array_equal(policies.load(saved).predict(obs)[0], want)
+
+
+def test_acting_needs_no_sb3(tmp_path: Path) -> None:
+    """A loaded policy acts, and a robot is driven by it, where SB3 is not even imported."""
+    actor_critic = mlp_policy()
+    policies.save(tmp_path / "policy", actor_critic, {})
+    code = (
+        "import sys\n"
+        "import numpy as np\n"
+        "import tdgc.benchmark.evaluation\n"
+        "from tdgc import policies\n"
+        "policy = policies.load(sys.argv[1])\n"
+        "print(policy.predict(np.ones(policy.obs_dim))[0].tolist())\n"
+        "print([m for m in sys.modules if m.startswith(('stable_baselines3', 'sb3_contrib'))])\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "policy")]
+    root = Path(__file__).resolve().parents[1]
+    result = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
+    *_, action, loaded = result.stdout.splitlines()
+    expected, _ = actor_critic.predict(np.ones(OBS, np.float32), deterministic=True)
+    np.testing.assert_allclose(json.loads(action), expected, atol=1e-6)
+    assert loaded == "[]"

@@ -13,9 +13,9 @@ import pytest
 
 import evaluate
 import train_low
-from tdgc.commands import CommandDecoder
-from tdgc.evaluation import CONDITIONS
-from tdgc.terrain import file_label
+from tdgc.benchmark.evaluation import CONDITIONS
+from tdgc.sim.commands import CommandDecoder
+from tdgc.sim.terrain import file_label
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -214,5 +214,5 @@ def test_conditions_are_named() -> None:
 def test_map_names_what_is_there() -> None:
     named = {row[0] for row in rows("Repository map")}
     assert not [name for name in named if not (ROOT / name).exists()]
-    modules = [*ROOT.glob("*.py"), *(ROOT / "tdgc").glob("[a-z]*.py")]
+    modules = [*ROOT.glob("*.py"), *(ROOT / "tdgc").rglob("[a-z]*.py")]
     assert not {str(path.relative_to(ROOT)) for path in modules} - named

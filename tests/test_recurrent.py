@@ -9,7 +9,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
-from tdgc.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 
 OBS, ACT, HIDDEN = 6, 2, 16
 ENVS, STEPS = 5, 12

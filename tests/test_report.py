@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tdgc import report
-from tdgc.diagnosis import Diagnosis
-from tdgc.evaluation import CONDITIONS, Episode, write_results
+from tdgc.benchmark.diagnosis import Diagnosis
+from tdgc.benchmark.evaluation import CONDITIONS, Episode, write_results
+from tdgc.show import report
 
 EVIL = "<script>alert('x')"  # a policy's name
 EVIL_CAUSE = "</td><img src=http://example.org/x onerror=alert(1)>"

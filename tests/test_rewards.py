@@ -7,13 +7,21 @@ import numpy as np
 import pybullet
 import pytest
 
-from tdgc import rewards
-from tdgc.commands import INDEX, default_command
 from tdgc.config import HighRewardConfig, LowRewardConfig, RobotConfig
-from tdgc.gaits import desired_contact, gait_embedding, swing_profile
-from tdgc.geometry import read_geometry
-from tdgc.rewards import HIGH_TERMS, LOW_TERMS, HighStep, LowStep, high_terms, low_terms, total
-from tdgc.robot import Array, RobotState, foot_kinematics, nominal_pose
+from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.gaits import desired_contact, gait_embedding, swing_profile
+from tdgc.sim.geometry import read_geometry
+from tdgc.sim.robot import Array, RobotState, foot_kinematics, nominal_pose
+from tdgc.tasks import rewards
+from tdgc.tasks.rewards import (
+    HIGH_TERMS,
+    LOW_TERMS,
+    HighStep,
+    LowStep,
+    high_terms,
+    low_terms,
+    total,
+)
 
 E = math.exp
 GEOMETRY = read_geometry(RobotConfig())

@@ -10,11 +10,11 @@ import numpy as np
 import pybullet
 import pytest
 
-from tdgc.commands import INDEX, default_command
 from tdgc.config import RobotConfig
-from tdgc.gaits import FEET
-from tdgc.geometry import JOINTS, read_geometry, urdf_path
-from tdgc.robot import (
+from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.gaits import FEET
+from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.sim.robot import (
     HIGHEST_FOOT,
     Array,
     RobotState,

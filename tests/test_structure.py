@@ -3,8 +3,10 @@
 import ast
 import os
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from importlib import import_module
 from pathlib import Path
 
@@ -15,54 +17,29 @@ import tdgc
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: A module may import modules of a lower rank only, so there is no cycle. A new module needs a
-#: rank here; a rank may wait for its module.
-RANKS = {
-    "tdgc": 0,
-    "errors": 0,
-    "cores": 0,
-    "config": 1,
-    "state": 1,
-    "terrain": 1,
-    "gaits": 1,
-    "curriculum": 1,
-    "commands": 2,
-    "geometry": 2,
-    "tiles": 2,
-    "robot": 3,
-    "worker": 2,
-    "cluster": 3,
-    "world": 4,
-    "group": 4,
-    "rewards": 4,
-    "locomotion": 5,
-    "policies": 5,
-    "leaps": 6,
-    "low_env": 7,
-    "recurrent": 7,
-    "teacher": 7,
-    "high_env": 8,
-    "imitation": 8,
-    "vec": 8,
-    "training": 9,
-    "drivers": 9,
-    "evaluation": 10,
-    "recording": 11,
-    "trace": 11,
-    "tuning": 11,
-    "bench": 11,
-    "calibration": 11,
-    "export": 11,
-    "plots": 12,
-    "diagnosis": 13,
-    "film": 13,
-    "report": 14,
-    "gui": 14,
-    "train_low": 15,
-    "train_high": 15,
-    "evaluate": 15,
+#: From the ground up: rooms (folders) and modules that stand in none. A module imports from lower
+#: floors and from its own room only, so rooms on the same floor know nothing of each other.
+FLOORS = (
+    ("tdgc", "errors", "state"),
+    ("config",),
+    ("policies", "sim"),
+    ("parallel",),
+    ("tasks",),
+    ("learn", "benchmark"),
+    ("show", "bench", "calibration", "export"),
+    ("train_low", "train_high", "evaluate"),
+)
+FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+SCRIPTS = FLOORS[-1]
+#: Names that scripts of others import, each from where it is defined.
+DOORS = {
+    "terrain": ("sim.terrain", {"make_tile"}),
+    "commands": ("sim.commands", {"CommandDecoder"}),
+    "gaits": ("sim.gaits", {"GAITS", "PhaseClock"}),
+    "high_env": ("tasks.high_env", {"load_low"}),
+    "drivers": ("benchmark.drivers", {"BaselineDriver", "HierarchyDriver", "load_high"}),
+    "evaluation": ("benchmark.evaluation", {"Cell", "run_cell"}),
 }
-SCRIPTS = ("train_low", "train_high", "evaluate")
 
 
 def sources() -> dict[str, Path]:
@@ -90,59 +67,106 @@ def imports(tree: ast.AST) -> Iterator[str]:
                 yield str(name.value)
 
 
-def own(name: str, modules: dict[str, Path]) -> str | None:
+def own(name: str) -> str | None:
     """The module of this repository that a dotted name means, or None."""
     first, _, rest = name.partition(".")
     if first in SCRIPTS:
         return first
     if first != "tdgc":
         return None
-    second = rest.partition(".")[0]
-    return second if second in modules or second in RANKS else "tdgc"
+    module = rest
+    while module and module not in MODULES:
+        module = module.rpartition(".")[0]
+    # An installed copy of an earlier version would answer for a module that has moved.
+    assert module or rest in ("", "__version__", "ENVIRONMENTS"), f"{name}: there is no such module"
+    return module or "tdgc"
+
+
+def used(module: str) -> set[str]:
+    """The modules of this repository that one of them imports."""
+    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+    return {name for name in map(own, imports(tree)) if name is not None}
+
+
+def room(module: str) -> str:
+    """The folder a module stands in, or itself where it stands in none."""
+    return module.partition(".")[0]
 
 
 MODULES = sources()
+INSIDE = [module for module in MODULES if module not in DOORS]
 
 
-def test_every_module_has_a_rank() -> None:
-    assert not MODULES.keys() - RANKS.keys()
+def test_every_room_has_a_floor() -> None:
+    assert set(map(room, INSIDE)) == FLOOR.keys()
+
+
+@pytest.mark.parametrize("module", INSIDE)
+def test_imports_point_one_way(module: str) -> None:
+    mine = room(module)
+    wrong = sorted(
+        name
+        for name in used(module) - DOORS.keys()
+        if room(name) != mine and FLOOR[room(name)] >= FLOOR[mine]
+    )
+    assert not wrong, f"{module} imports {', '.join(wrong)}, which is not below it"
+
+
+def test_no_modules_import_each_other() -> None:
+    graph = {module: used(module) for module in MODULES}
+    assert len(list(TopologicalSorter(graph).static_order())) == len(MODULES)
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_imports_point_one_way(module: str) -> None:
-    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
-    used = {name for name in (own(n, MODULES) for n in imports(tree)) if name is not None}
-    wrong = sorted(name for name in used if RANKS[name] >= RANKS[module])
-    assert not wrong, f"{module} imports {', '.join(wrong)}, which is not below it"
+def test_nothing_inside_goes_through_a_door(module: str) -> None:
+    assert not used(module) & DOORS.keys()
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_doors_lead_to_what_they_name(door: str) -> None:
+    place, names = DOORS[door]
+    opened, home = import_module(f"tdgc.{door}"), import_module(f"tdgc.{place}")
+    assert set(opened.__all__) == names
+    assert all(getattr(opened, name) is getattr(home, name) for name in names)
+    tree = ast.parse(MODULES[door].read_text(encoding="utf-8"))
+    assert [type(node) for node in tree.body] == [ast.ImportFrom, ast.Assign]
+
+
+def test_importing_the_package_is_light() -> None:
+    code = "import sys, tdgc; print(*(m for m in sys.modules if m.startswith('tdgc')))"
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["tdgc"]
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_only_world_imports_pybullet(module: str) -> None:
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     bullet = [name for name in imports(tree) if name.startswith("pybullet")]
-    assert bool(bullet) == (module == "world"), f"{module}: {bullet}"
+    assert bool(bullet) == (module == "sim.world"), f"{module}: {bullet}"
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_only_cluster_imports_ray_and_not_before_it_is_asked_for(module: str) -> None:
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     asked = [name for name in imports(tree) if name.partition(".")[0] == "ray"]
-    assert bool(asked) == (module == "cluster"), f"{module}: {asked}"
+    assert bool(asked) == (module == "parallel.cluster"), f"{module}: {asked}"
     at_once = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
     assert not [name for name in imports(at_once) if name.partition(".")[0] == "ray"]
 
 
 def test_rules_see_every_kind_of_import() -> None:
     tree = ast.parse(
-        "import tdgc.world as w\n"
-        "from tdgc import rewards, __version__\n"
+        "import tdgc.sim.world as w\n"
+        "from tdgc import config, __version__\n"
+        "from tdgc.tasks import rewards\n"
         "def f():\n"
-        "    from tdgc.vec import TaskVecEnv\n"
+        "    from tdgc.parallel.vec import TaskVecEnv\n"
         "    importlib.import_module('pybullet')\n"
     )
     found = list(imports(tree))
-    assert [own(name, MODULES) for name in found if name.startswith("tdgc")] == [
-        "world", "rewards", "tdgc", "vec"
+    assert [own(name) for name in found if name.startswith("tdgc")] == [
+        "sim.world", "config", "tdgc", "tasks.rewards", "parallel.vec"
     ]  # fmt: skip
     assert "pybullet" in found
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tdgc.commands import INDEX, CommandDecoder, gait_index
 from tdgc.config import PhysicsConfig, RobotConfig
-from tdgc.leaps import STANCE_LENGTH, STRIDE, straddling_frequency
-from tdgc.locomotion import Locomotion
-from tdgc.teacher import STYLES, Teacher, travel_cost, trenches
-from tdgc.terrain import TileField, make_tile, trench_centres
+from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.terrain import TileField, make_tile, trench_centres
+from tdgc.tasks.leaps import STANCE_LENGTH, STRIDE, straddling_frequency
+from tdgc.tasks.teacher import STYLES, Teacher, travel_cost, trenches
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
-from tdgc import terrain
-from tdgc.terrain import (
+from tdgc.sim import terrain
+from tdgc.sim.terrain import (
     ALL_FAMILIES,
     EVAL_STREAM,
     FAMILIES,
@@ -31,11 +31,11 @@ def tile(family: str, difficulty: float, seed: int = 0) -> Tile:
 @pytest.mark.parametrize(
     ("family", "at_0", "at_1", "at_12"),
     [
-        ("rough", 0.01, 0.08, 0.094),
+        ("rough", 0.01, 0.10, 0.118),
         ("pillar", 4, 24, 28),
-        ("stair", 0.03, 0.13, 0.15),
-        ("gap", 0.05, 0.25, 0.29),
-        ("tilt", 0.0, 0.40, 0.48),
+        ("stair", 0.03, 0.15, 0.174),
+        ("gap", 0.05, 0.30, 0.35),
+        ("tilt", 0.0, 0.45, 0.54),
     ],
 )
 def test_difficulty_parameter_is_affine(family, at_0, at_1, at_12):
@@ -90,8 +90,15 @@ def test_same_seed_same_tile(family):
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
     assert one.parts == same.parts
     assert (one.start != other.start).any()
-    if family in ("rough", "pillar"):  # the only ones whose surface is random
-        assert (one.heights != other.heights).any()
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_layouts_differ_within_a_level_and_from_level_to_level(family):
+    made = [tile(family, 1, seed).heights for seed in range(8)]
+    different = {heights.tobytes() for heights in made}
+    assert len(different) == (2 if family == "tilt" else 8)  # a slope falls to either side
+    levels = {tile(family, level / 10, 3).heights.tobytes() for level in range(11)}
+    assert len(levels) == 11
 
 
 def test_a_tile_of_a_height_map(tmp_path):
@@ -121,7 +128,7 @@ def test_a_tile_of_a_height_map(tmp_path):
         (np.full((161, 161), np.nan), "must hold finite heights"),
         (np.zeros((161, 161), dtype=bool), "must hold finite heights"),
         (np.array([{}], dtype=object), "cannot be read as a NumPy file: .*allow_pickle"),
-        (np.full((161, 161), -1.8), r"must stay within 1\.75 m of the platforms' height$"),
+        (np.full((161, 161), -2.1), r"must stay within 2\.08333 m of the platforms' height$"),
     ],
     ids=["none", "text", "shape", "nan", "bool", "pickle", "deep"],
 )
@@ -159,7 +166,7 @@ def test_bad_family_names_the_families():
 # Family by family
 
 
-@pytest.mark.parametrize(("difficulty", "amplitude"), [(0, 0.01), (0.5, 0.045), (1, 0.08)])
+@pytest.mark.parametrize(("difficulty", "amplitude"), [(0, 0.01), (0.5, 0.055), (1, 0.10)])
 def test_rough_is_zero_mean_and_reaches_its_amplitude(difficulty, amplitude):
     for seed in range(5):
         heights = tile("rough", difficulty, seed).heights
@@ -170,17 +177,21 @@ def test_rough_is_zero_mean_and_reaches_its_amplitude(difficulty, amplitude):
         assert zone.std() > 0.2 * amplitude  # noise, not one peak
 
 
-def test_rough_is_bilinear_between_lattice_nodes():
-    zone = tile("rough", 1).heights[32:129].astype(float)  # nodes every 4 samples
-    along_x, along_y = np.diff(zone, axis=0), np.diff(zone, axis=1)
-    np.testing.assert_allclose(along_x[0::4], along_x[3::4], atol=1e-7)
-    np.testing.assert_allclose(along_y[:, 0::4], along_y[:, 3::4], atol=1e-7)
-    assert np.abs(along_x[3:-1:4] - along_x[4::4]).max() > 0.01  # and bends at the nodes
+def test_rough_is_bilinear_on_a_lattice_of_five_spacings():
+    """Second differences along x vanish between the nodes of one of the lattices, of each once."""
+    found = set()
+    for seed in range(40):
+        zone = tile("rough", 1, seed).heights[30:131].astype(float)
+        bends = np.abs(np.diff(zone, 2, axis=0)).max(axis=1) > 1e-6  # at samples 31 to 129
+        spacings = set(np.diff(np.flatnonzero(bends)))
+        found.add(min(spacings))
+        assert spacings <= {min(spacings)}  # nodes are evenly apart
+    assert found == {2, 3, 4, 5, 6}  # cells: 0.1 to 0.3 m
 
 
 def test_rough_blends_in_and_out_linearly():
     blended = tile("rough", 1).heights
-    weights = np.abs(blended).max(axis=1) / 0.08
+    weights = np.abs(blended).max(axis=1) / 0.10
     for near, far in [(25, 135), (26, 134), (27, 133), (28, 132), (29, 131)]:
         limit = (near - 25) / 5
         assert weights[near] <= limit + 1e-6 and weights[far] <= limit + 1e-6
@@ -214,51 +225,77 @@ def test_pillars_that_cannot_fit_raise():
         terrain.place_pillars(narrow, 28, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize(("difficulty", "step"), [(0, 0.03), (0.5, 0.08), (1, 0.13), (1.2, 0.15)])
-def test_stair_heights_are_exact(difficulty, step):
-    heights = tile("stair", difficulty).heights
-    assert (heights == heights[:, :1]).all()  # the same all across
-    profile = heights[:, 0]
-    up = np.repeat(np.arange(1, 9), 6)[:44]  # 8 treads of 6 cells, the last runs into the landing
-    expected = np.zeros(161)
-    expected[31:75] = up
-    expected[75:81] = 8
-    expected[80:] = expected[80::-1]
-    np.testing.assert_array_equal(profile, (expected * step).astype(np.float32))
-    risers = np.flatnonzero(np.diff(profile) > 0)  # the cell from this sample to the next
-    np.testing.assert_allclose(risers * 0.05, 1.5 + 0.3 * np.arange(8), atol=1e-9)
-    np.testing.assert_array_equal(profile, profile[::-1])
+@pytest.mark.parametrize(("difficulty", "step"), [(0, 0.03), (0.5, 0.09), (1, 0.15), (1.2, 0.174)])
+def test_stairs(difficulty, step):
+    counts = set()
+    for seed in range(60):
+        made = tile("stair", difficulty, seed)
+        assert (made.heights == made.heights[:, :1]).all()  # the same all across
+        rise = np.diff(made.heights[:, 0].astype(float))
+        up, down = np.flatnonzero(rise > 1e-6), np.flatnonzero(rise < -1e-6)  # single cells
+        np.testing.assert_allclose(rise[up], step, atol=1e-6)
+        np.testing.assert_allclose(rise[down], -step, atol=1e-6)
+        assert len(up) == len(down) >= 5 and up[-1] < down[0]
+        assert 30 <= up[0] and down[-1] <= 129  # in the zone
+        treads = np.concatenate([np.diff(up), np.diff(down)])
+        assert set(treads) <= {5, 6, 7, 8} and len(set(treads)) > 1
+        assert down[0] - up[-1] - 1 >= 6  # level samples between: 0.3 m
+        # No further step fits on either side.
+        assert down[-1] - up[0] + 1 + 10 > 100 - 16 and len(up) <= 10
+        risers = made.features.risers
+        np.testing.assert_allclose(risers[:, 0], 0.05 * (np.concatenate([up, down]) + 0.5))
+        np.testing.assert_allclose(risers[:, 1], np.repeat([step, -step], len(up)))
+        counts.add(len(up))
+    assert counts >= {7, 8}
 
 
-@pytest.mark.parametrize(
-    ("level", "lowered"), list(enumerate([1, 1, 2, 2, 3, 3, 3, 4, 4, 5, 5, 5, 6]))
-)
-def test_gap_trenches(level, lowered):
-    heights = tile("gap", level / 10).heights
-    assert (heights == heights[:, :1]).all()  # across the whole tile
-    profile = heights[:, 0]
-    assert set(np.unique(profile)) == {np.float32(-0.6), np.float32(0)}
-    deep = np.flatnonzero(profile).reshape(4, lowered)
-    assert (np.diff(deep, axis=1) == 1).all()
-    middles = (deep[:, 0] + deep[:, -1]) / 2 * 0.05
-    shift = 0.025 * (lowered % 2)
-    np.testing.assert_allclose(middles + shift, [2.125, 3.375, 4.625, 5.875], atol=1e-9)
-    # The opening at half depth is the parameter w, to half a cell.
-    assert abs(lowered * 0.05 - difficulty_parameter("gap", level / 10)) <= 0.025 + 1e-9
+@pytest.mark.parametrize("level", range(13))
+def test_gap_trenches(level):
+    width = difficulty_parameter("gap", level / 10)
+    cells, counts, places = [], set(), []
+    for seed in range(100):
+        made = tile("gap", level / 10, seed)
+        assert (made.heights == made.heights[:, :1]).all()  # across the whole tile
+        profile = made.heights[:, 0]
+        assert set(np.unique(profile)) == {np.float32(-0.6), np.float32(0)}
+        fall, rise = np.flatnonzero(np.diff(profile) < 0), np.flatnonzero(np.diff(profile) > 0)
+        np.testing.assert_allclose(made.features.trenches, 0.05 * np.stack([fall, rise + 1], 1))
+        centres = made.features.trenches.mean(axis=1)
+        assert 3 <= len(centres) <= 5 and np.diff(centres).min() >= 0.75 - 1e-9
+        assert centres.min() >= 1.8 - 1e-9 and centres.max() <= 6.2 + 1e-9
+        cells += list(rise - fall)  # at half depth
+        counts.add(len(centres))
+        places += list(centres)
+    assert set(cells) <= {math.floor(width / 0.05 + 1e-9), math.ceil(width / 0.05 - 1e-9)}
+    assert 0.05 * np.mean(cells) == pytest.approx(width, abs=0.005)
+    assert counts == {3, 4, 5} and min(places) < 1.9 and max(places) > 6.1
 
 
-def test_tilt_slopes_sideways_and_blends_over_half_a_metre():
+def test_tilt_slopes_to_either_side_and_blends_over_half_a_metre():
     assert not tile("tilt", 0).heights.any()
-    heights = tile("tilt", 1).heights
-    slope = math.tan(0.4)
-    for ix in (35, 60, 80, 125):  # x = 1.75 ... 6.25
-        assert heights[ix, 0] == pytest.approx(-4 * slope, abs=1e-6)
-        assert heights[ix, 80] == 0
-        assert heights[ix, 100] == pytest.approx(slope, abs=1e-6)
-        assert heights[ix, 160] == pytest.approx(4 * slope, abs=1e-6)
-    ramp = np.arange(11) / 10 * slope  # at y = 5, x = 1.25 ... 1.75
-    np.testing.assert_allclose(heights[25:36, 100], ramp, atol=1e-6)
-    np.testing.assert_allclose(heights[125:136, 100], ramp[::-1], atol=1e-6)
+    sides = []
+    for seed in range(40):
+        made = tile("tilt", 1, seed)
+        side = np.sign(made.heights[80, 160])
+        sides.append(side)
+        assert made.features.slope == pytest.approx(0.45 * side)
+        heights, slope = side * made.heights, math.tan(0.45)
+        for ix in (35, 60, 80, 125):  # x = 1.75 ... 6.25
+            assert heights[ix, 0] == pytest.approx(-4 * slope, abs=1e-6)
+            assert heights[ix, 80] == 0
+            assert heights[ix, 160] == pytest.approx(4 * slope, abs=1e-6)
+        ramp = np.arange(11) / 10 * slope  # at y = 5, x = 1.25 ... 1.75
+        np.testing.assert_allclose(heights[25:36, 100], ramp, atol=1e-6)
+        np.testing.assert_allclose(heights[125:136, 100], ramp[::-1], atol=1e-6)
+    assert 10 <= sides.count(1.0) <= 30 and len(set(sides)) == 2
+
+
+def test_pillars_are_where_the_tile_says():
+    made = tile("pillar", 1)
+    x, y, diameter = made.features.pillars.T
+    grid = np.arange(161) * 0.05
+    away = np.hypot(grid[:, None, None] - x, grid[None, :, None] - y) - diameter / 2
+    np.testing.assert_array_equal(made.heights > 0, (away <= 1e-12).any(axis=-1))
 
 
 # Mixed
@@ -294,18 +331,37 @@ def mixed_half(family: str, difficulty: float) -> np.ndarray:
 
 def test_mixed_halves_have_the_same_parameters():
     rough_half = mixed_half("rough", 1)[30:76].astype(float)  # to where it blends out
-    assert np.abs(rough_half).max() == pytest.approx(0.08, rel=1e-6)
+    assert np.abs(rough_half).max() == pytest.approx(0.10, rel=1e-6)
     assert abs(rough_half.mean()) < 1e-6
     assert count_blobs(mixed_half("pillar", 1) > 0) == 12  # half the zone, half of 24
     stair_half = mixed_half("stair", 1)[:, 0]
-    assert stair_half.max() == np.float32(4 * 0.13)
-    np.testing.assert_array_equal(np.flatnonzero(np.diff(stair_half) > 0), [30, 36, 42, 48])
-    np.testing.assert_array_equal(mixed_half("gap", 1), tile("gap", 1).heights[:81])
-    tilt_half = mixed_half("tilt", 1)[:, 100]
-    np.testing.assert_array_equal(tilt_half[:71], tile("tilt", 1).heights[:71, 100])
+    rise = np.diff(stair_half)
+    assert 3 <= (rise > 0).sum() == (rise < 0).sum() <= 5
+    np.testing.assert_allclose(rise[rise > 0], 0.15, atol=1e-6)
+    gap_half = mixed_half("gap", 1)[:, 0]
+    assert (np.diff(gap_half) < 0).sum() == 2
+    tilt_half = np.abs(mixed_half("tilt", 1)[:, 100])
+    np.testing.assert_allclose(tilt_half[35:71], math.tan(0.45), atol=1e-6)
     np.testing.assert_allclose(
-        tilt_half[70:], np.arange(10, -1, -1) / 10 * math.tan(0.4), atol=1e-6
+        tilt_half[70:], np.arange(10, -1, -1) / 10 * math.tan(0.45), atol=1e-6
     )
+
+
+def test_mixed_has_the_features_of_both_halves():
+    for seed in range(60):
+        made = tile("mixed", 1, seed)
+        for part, (low, high) in zip(made.parts, ((1.5, 4.0), (4.0, 6.5)), strict=True):
+            found = made.features
+            if part == "gap":
+                assert len(found.trenches) == 2
+                assert low < found.trenches.min() and found.trenches.max() < high
+            elif part == "stair":
+                assert low < found.risers[:, 0].min() and found.risers[:, 0].max() < high
+            elif part == "pillar":
+                assert len(found.pillars) == 12
+                assert low < found.pillars[:, 0].min() and found.pillars[:, 0].max() < high
+            elif part == "tilt":
+                assert abs(found.slope) == pytest.approx(0.45)
 
 
 def test_mixed_support_drops_only_trenches_and_pillars():

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from tdgc.terrain import Tile, make_tile, tile_rng
-from tdgc.tiles import FLAT, TrainingTiles
+from tdgc.sim.terrain import Tile, make_tile, tile_rng
+from tdgc.tasks.tiles import FLAT, TrainingTiles
 
 FAMILIES = ("stair", FLAT, "rough")
 ALL = np.arange(3)

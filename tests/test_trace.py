@@ -16,17 +16,17 @@ from test_drivers import save_high
 from test_evaluation import SMALL
 
 import evaluate
-from tdgc import evaluation, trace
-from tdgc.commands import CONTINUOUS, INDEX, NAMES, CommandDecoder
+from tdgc.benchmark import evaluation, trace
+from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
+from tdgc.benchmark.evaluation import Cell, Episode, run_cell
+from tdgc.benchmark.trace import COLUMNS, Selection, Trace, TraceError, Tracer
 from tdgc.config import CommandRanges, HighRewardConfig
-from tdgc.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
-from tdgc.evaluation import Cell, Episode, run_cell
-from tdgc.gaits import FEET, GAITS
-from tdgc.high_env import PRETRAINED, height_probes, load_low
-from tdgc.locomotion import Locomotion
-from tdgc.robot import Array
-from tdgc.terrain import TileField
-from tdgc.trace import COLUMNS, Selection, Trace, TraceError, Tracer
+from tdgc.sim.commands import CONTINUOUS, INDEX, NAMES, CommandDecoder
+from tdgc.sim.gaits import FEET, GAITS
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.sim.terrain import TileField
+from tdgc.tasks.high_env import PRETRAINED, height_probes, load_low
 
 ROOT = Path(__file__).resolve().parents[1]
 HOLD = 5  # control steps a decision

@@ -26,10 +26,7 @@ import train_high
 import train_low
 from tdgc import policies
 from tdgc.config import LowTrainConfig, PPOConfig, from_dict, to_dict, with_overrides
-from tdgc.cores import usable_cores
-from tdgc.low_env import LowLevelTask
-from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
-from tdgc.training import (
+from tdgc.learn.training import (
     CheckpointError,
     Interruption,
     add_arguments,
@@ -42,7 +39,10 @@ from tdgc.training import (
     snapshot,
     workers_of,
 )
-from tdgc.vec import worker_seed
+from tdgc.parallel.cores import usable_cores
+from tdgc.parallel.vec import worker_seed
+from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
+from tdgc.tasks.low_env import LowLevelTask
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -562,7 +562,7 @@ def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return configure(LowTrainConfig(), parser.parse_args(flags)).workers
 
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(3)))
-    monkeypatch.setattr("tdgc.training.usable_cores", lambda: usable_cores(tmp_path))
+    monkeypatch.setattr("tdgc.learn.training.usable_cores", lambda: usable_cores(tmp_path))
     assert workers() == workers("--set", "workers=2") == 2
     assert workers("--workers", "auto") == 3
     assert workers("--workers", "auto", "--n-envs", "25") == 2

@@ -14,15 +14,9 @@ from test_drivers import save_high
 from test_evaluation import rows_of
 
 import evaluate
-from tdgc.commands import CONTINUOUS, INDEX, gait_index
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig
-from tdgc.drivers import HierarchyDriver, load_high
-from tdgc.evaluation import Episode
-from tdgc.gaits import GAITS
-from tdgc.high_env import PRETRAINED, load_low
-from tdgc.locomotion import Locomotion
-from tdgc.robot import Array
-from tdgc.tuning import (
+from tdgc.benchmark.drivers import HierarchyDriver, load_high
+from tdgc.benchmark.evaluation import Episode
+from tdgc.benchmark.tuning import (
     DecoderTuning,
     Limits,
     TunedDriver,
@@ -33,6 +27,12 @@ from tdgc.tuning import (
     record,
     tuned_ranges,
 )
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig
+from tdgc.sim.commands import CONTINUOUS, INDEX, gait_index
+from tdgc.sim.gaits import GAITS
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.tasks.high_env import PRETRAINED, load_low
 
 HIGH, LOW = HighLevelConfig(), LowLevelConfig()
 

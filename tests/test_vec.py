@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from tdgc.config import LowLevelConfig, PhysicsConfig
-from tdgc.low_env import LowLevelTask
-from tdgc.robot import Array
+from tdgc.parallel.vec import TaskVecEnv, worker_seed
+from tdgc.parallel.worker import WorkerError
+from tdgc.sim.robot import Array
 from tdgc.state import State, split
-from tdgc.vec import TaskVecEnv, worker_seed
-from tdgc.worker import WorkerError
+from tdgc.tasks.low_env import LowLevelTask
 
 CONFIG = LowLevelConfig(episode_seconds=0.5, physics=PhysicsConfig(substeps=4))
 
@@ -246,8 +246,8 @@ import functools
 from pathlib import Path
 import torch
 from tdgc.config import LowLevelConfig
-from tdgc.low_env import LowLevelTask
-from tdgc.vec import TaskVecEnv
+from tdgc.tasks.low_env import LowLevelTask
+from tdgc.parallel.vec import TaskVecEnv
 
 class Own(LowLevelTask):
     pass

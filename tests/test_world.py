@@ -13,12 +13,12 @@ import pybullet
 import pytest
 
 from tdgc.config import PhysicsConfig, RobotConfig
-from tdgc.geometry import read_geometry
-from tdgc.locomotion import Locomotion
-from tdgc.low_env import is_fallen
-from tdgc.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
-from tdgc.terrain import ALL_FAMILIES, HEIGHT_RANGE, TileField, make_tile, tile_rng
-from tdgc.world import CLIENT_ROBOTS, World
+from tdgc.sim.geometry import read_geometry
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
+from tdgc.sim.terrain import ALL_FAMILIES, HEIGHT_RANGE, TileField, make_tile, tile_rng
+from tdgc.sim.world import CLIENT_ROBOTS, World
+from tdgc.tasks.low_env import is_fallen
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()
 GEOMETRY, NOMINAL = read_geometry(ROBOT), nominal_pose(ROBOT)

@@ -1,0 +1,1 @@
+"""The benchmark: who drives, episodes, and what is found in them."""

@@ -1,0 +1,326 @@
+"""Diagnosis: why an episode failed, from its trace; which layer is to blame, and on what evidence.
+
+- ``terrain``: the tile is of a kind that nothing was trained on.
+- ``execution``: the low level lost track of its commands, or the robot fell under a sane one.
+- ``decisions``: the commands were carried out, and they led to the failure.
+
+Tracking is lost where its errors are larger than in all but a few stretches of episodes that
+reached their goals: ``LIMITS``.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.benchmark.evaluation import Episode, EpisodeRecord, tile_of
+from tdgc.benchmark.trace import TRACKED, Trace
+from tdgc.sim.terrain import (
+    GOAL_BEGIN,
+    MAX_LEVEL,
+    PILLAR_HEIGHT,
+    START_END,
+    TILE_SIZE,
+    ZONE,
+    Tile,
+)
+
+LAYERS = ("decisions", "execution", "terrain")
+
+#: m/s away from the goal, asked for on average while judged. In 165 episodes that reached it never
+#: less than 0.4 m/s towards it was, and fast backwards is where tracking is worst.
+AWAY = 0.2
+LOOK_BACK = 2.0  # s before the end that are judged: four to eight gait cycles
+SETTLE = 1.0  # s at the start that are not: speeding up from rest, as in the tracking test
+#: m ahead of the hips: a foot that reaches out from there. With hips 0.18 m ahead of the trunk's
+#: centre a trunk was hit at up to 0.25 m from a pillar's edge, and a robot held up by one stood at
+#: up to 0.29 m.
+REACH = 0.2
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What an error of tracking stays below in episodes that succeed.
+
+    Attributes:
+        unit: of the error.
+        stretch: for its mean over ``LOOK_BACK``.
+        episode: for its mean over a whole episode, by which a timeout is judged.
+    """
+
+    unit: str
+    stretch: float
+    episode: float
+
+
+#: The 95th percentiles of all stretches, and of all episodes, of 162 that reached their goals: both
+#: policies, levels 6 and 8 of all families, evaluation seeds 1 and 2, the baseline at 0.5 m/s.
+#: Stairs make up the upper end.
+LIMITS: dict[str, Limit] = {
+    "velocity": Limit("m/s", 0.26, 0.21),
+    "yaw rate": Limit("rad/s", 0.12, 0.10),
+    "tilt": Limit("rad", 0.34, 0.13),
+}
+
+
+@dataclass(frozen=True)
+class Diagnosis(EpisodeRecord):
+    """A failed episode's row of diagnosis.csv.
+
+    Attributes:
+        time_s: s, when it ended.
+        place: where on the tile: a platform, a transition or the zone.
+        feature: the nearest trench, step or pillar and how far it is from the trunk; or empty.
+        layer: one of ``LAYERS``.
+        cause: what went wrong, in a few words; there is a small number of them.
+        evidence: the numbers that say so.
+    """
+
+    time_s: float
+    place: str
+    feature: str
+    layer: str
+    cause: str
+    evidence: str
+
+
+def diagnose(trace: Trace, hips: float) -> Diagnosis:
+    """Which layer failed in the episode of ``trace``, and why.
+
+    Args:
+        trace: of an episode that failed.
+        hips: m, how far ahead of the trunk's centre the robot's hips are.
+
+    Raises:
+        ValueError: it did not fail.
+    """
+    if trace.outcome == "reached":
+        raise ValueError("an episode that reached its goal has not failed")
+    tile = tile_of(trace.seed, trace.family, trace.level, trace.episode)
+    x, y = float(trace["base_x"][-1]), float(trace["base_y"][-1])
+    found = sorted(features(tile, x, y), key=lambda feature: feature[1])
+    feature = f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
+    layer, cause, evidence = _judge(trace, tile, hips)
+    return Diagnosis(
+        trace.policy,
+        trace.condition,
+        trace.family,
+        trace.level,
+        trace.episode,
+        trace.seed,
+        trace.outcome,
+        round(float(trace["time"][-1]), 2),
+        place_of(x),
+        feature,
+        layer,
+        cause,
+        evidence,
+    )
+
+
+# ---------------------------------------------------------------------------- which layer
+
+
+def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
+    """Layer, cause and evidence."""
+    intervals, held = judged(trace), near_pillar(trace, tile, hips + REACH)
+    # Against a pillar or over the edge nothing is tracked, and that is no fault of who tracks.
+    errors = tracking_errors(trace, intervals & ~(held | near_edge(trace, hips))[1:])
+    limits = {
+        name: limit.episode if trace.outcome == "timeout" else limit.stretch
+        for name, limit in LIMITS.items()
+    }
+    lost = [name for name, error in errors.items() if error > limits[name]]
+    towards = asked_towards(trace, intervals)
+    evidence = _evidence(trace, intervals, errors, limits, towards)
+    down = trace.outcome == "fell" or (trace.outcome == "collided" and not held[-1])
+    if trace.family == "mixed" or trace.level > MAX_LEVEL:
+        return "terrain", "never trained on", evidence
+    if towards < -AWAY:
+        return "decisions", "led away from the goal", evidence
+    if lost:
+        return "execution", f"lost track of {' and '.join(lost)}", evidence
+    if down and towards > 0.0:
+        return "execution", "lost its footing on the way to the goal", evidence
+    if down:
+        return "decisions", "lost its footing on the way elsewhere", evidence
+    if trace.outcome == "collided":
+        return "decisions", "steered into a pillar", evidence
+    if trace.outcome == "left_tile":
+        return "decisions", "steered off the tile", evidence
+    if held[-1]:
+        return "decisions", "held up by a pillar", evidence
+    return "decisions", "found no way to the goal", evidence
+
+
+def judged(trace: Trace) -> NDArray[np.bool_]:
+    """Which intervals between decisions, (n - 1,), an episode is judged by.
+
+    A timeout by all of them, any other end by the last ``LOOK_BACK``; either without ``SETTLE``.
+    """
+    time = trace["time"].astype(np.float64)
+    last = time[1:] > (0.0 if trace.outcome == "timeout" else time[-1] - LOOK_BACK)
+    return np.asarray(last & (time[:-1] > SETTLE - 1e-6))
+
+
+def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, float]:
+    """Sizes of the mean errors over ``intervals`` (n - 1,), by the names of ``LIMITS``.
+
+    A mean over gait cycles: what a trunk sways about its command does not count. Empty without an
+    interval.
+    """
+
+    def mean(name: str) -> float:
+        values = trace[f"error_{name}"][1:][intervals]
+        return float(np.average(values, weights=trace["seconds"][1:][intervals]))
+
+    if not intervals.any():
+        return {}
+    return {
+        "velocity": float(np.hypot(mean("vx"), mean("vy"))),
+        "yaw rate": abs(mean("yaw_rate")),
+        "tilt": float(np.hypot(mean("pitch"), mean("roll"))),
+    }
+
+
+def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
+    """Mean velocity commanded towards the goal over ``intervals`` (n - 1,), m/s."""
+    bearing = trace["goal_bearing"][:-1]
+    towards = trace["command_vx"][:-1] * np.cos(bearing) + trace["command_vy"][:-1] * np.sin(
+        bearing
+    )
+    if not intervals.any():
+        intervals = np.ones_like(intervals)
+    return float(np.average(towards[intervals], weights=trace["seconds"][1:][intervals]))
+
+
+def near_pillar(trace: Trace, tile: Tile, reach: float) -> NDArray[np.bool_]:
+    """Where the trunk was within ``reach`` m of a pillar, (n,): it may be held up by it."""
+    x, y = trace["base_x"], trace["base_y"]
+    return np.array([_to_pillar(tile, *at)[0] < reach for at in zip(x, y, strict=True)])
+
+
+def near_edge(trace: Trace, hips: float) -> NDArray[np.bool_]:
+    """Where the trunk was within ``hips`` m of the tile's edge, (n,): feet have nothing there."""
+    x, y = trace["base_x"], trace["base_y"]
+    inside = np.minimum(np.minimum(x, TILE_SIZE - x), np.minimum(y, TILE_SIZE - y))
+    return np.asarray(inside < hips)
+
+
+def _evidence(
+    trace: Trace,
+    intervals: NDArray[np.bool_],
+    errors: dict[str, float],
+    limits: dict[str, float],
+    towards: float,
+) -> str:
+    """The numbers that a diagnosis rests on, in words."""
+    words = [
+        f"{name} off by {error:.2f} {LIMITS[name].unit} (limit {limits[name]:g})"
+        for name, error in errors.items()
+    ] or ["tracking not judged: too short, at a pillar or at the edge"]
+    words.append(f"asked for {towards:+.2f} m/s towards the goal")
+    for name in TRACKED:
+        share = np.sum(trace[f"at_bound_{name}"][:-1][intervals] != 0.0) / max(intervals.sum(), 1)
+        if share > 0.5:
+            words.append(f"{name} at its bound {100 * share:.0f} % of the time")
+    span = "all along" if trace.outcome == "timeout" else f"in the last {LOOK_BACK:g} s"
+    return f"{span}: {'; '.join(words)}"
+
+
+# ---------------------------------------------------------------------------- where on the tile
+
+
+def place_of(x: float) -> str:
+    """The part of the tile at ``x`` m along it."""
+    if x < START_END:
+        return "start platform"
+    if x < ZONE[0]:
+        return "first transition"
+    if x <= ZONE[1]:
+        return "zone"
+    return "second transition" if x < GOAL_BEGIN else "goal platform"
+
+
+def features(tile: Tile, x: float, y: float) -> Iterator[tuple[str, float]]:
+    """The nearest trench, step and pillar of those that the tile has, each with its distance in m
+    from (x, y) m in the tile's frame; numbered along the way."""
+    found = tile.features
+    if len(found.trenches):
+        away = np.maximum(np.maximum(found.trenches[:, 0] - x, x - found.trenches[:, 1]), 0.0)
+        yield f"trench {away.argmin() + 1} of {away.size}", float(away.min())
+    if len(found.risers):
+        away = np.abs(x - found.risers[:, 0])
+        yield f"step {away.argmin() + 1} of {away.size}", float(away.min())
+    if len(found.pillars):
+        px, py, diameter = found.pillars.T
+        distance = np.maximum(np.hypot(px - x, py - y) - 0.5 * diameter, 0.0)
+        k = distance.argmin()
+        yield f"pillar at ({px[k]:.1f}, {py[k]:.1f}) m", float(distance[k])
+
+
+def _to_pillar(tile: Tile, x: float, y: float) -> tuple[float, float, float]:
+    """Distance in m from (x, y) to the nearest sample of a pillar, and where that is; inf if there
+    is none. A pillar is what rises over the support surface."""
+    ix, iy = np.nonzero(tile.heights - tile.support > 0.5 * PILLAR_HEIGHT)
+    if not ix.size:
+        return np.inf, np.nan, np.nan
+    away = np.hypot(x - tile.cell * ix, y - tile.cell * iy)
+    k = int(away.argmin())
+    return float(away[k]), float(tile.cell * ix[k]), float(tile.cell * iy[k])
+
+
+# ---------------------------------------------------------------------------- results
+
+
+def write(diagnoses: Sequence[Diagnosis], path: str | Path) -> None:
+    """Write diagnosis.csv: a row a failed episode, whole or not at all."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, [f.name for f in dataclasses.fields(Diagnosis)])
+    writer.writeheader()
+    writer.writerows(dataclasses.asdict(d) for d in diagnoses)
+    partial = Path(path).with_suffix(f".{os.getpid()}.tmp")
+    try:
+        partial.write_text(text.getvalue(), encoding="utf-8", newline="")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def describe(diagnoses: Sequence[Diagnosis], episodes: Sequence[Episode]) -> str:
+    """Failures by family and level, their layers and commonest cause, and where most is to be won.
+
+    Args:
+        diagnoses: of all failed episodes.
+        episodes: all episodes, failed or not.
+    """
+    lines: list[str] = []
+    runs = dict.fromkeys((e.policy, e.condition) for e in episodes)
+    for policy, condition in runs:
+        mine = [d for d in diagnoses if (d.policy, d.condition) == (policy, condition)]
+        total = sum((e.policy, e.condition) == (policy, condition) for e in episodes)
+        lines.append(f"failures of {policy}, {condition}: {len(mine)} of {total} episodes")
+        if not mine:
+            continue
+        head = "".join(f"{layer:>11}" for layer in LAYERS)
+        wide = max(8, *(len(d.family) + 1 for d in mine))
+        lines.append(f"{'family'.ljust(wide)}level{head}  commonest cause")
+        for family, level in dict.fromkeys((d.family, d.level) for d in mine):
+            cell = [d for d in mine if (d.family, d.level) == (family, level)]
+            counts = Counter(d.layer for d in cell)
+            numbers = "".join(f"{counts[layer]:>11}" for layer in LAYERS)
+            cause, times = Counter(d.cause for d in cell).most_common(1)[0]
+            lines.append(f"{family.ljust(wide)}{level:>5}{numbers}  {cause} ({times})")
+        (family, layer), count = Counter((d.family, d.layer) for d in mine).most_common(1)[0]
+        points = f"{100 * count / total:.1f} points of success"
+        lines.append(f"most is to be won in {family}, by {layer}: {points}")
+    return "\n".join(lines)

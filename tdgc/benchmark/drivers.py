@@ -1,0 +1,203 @@
+"""Who decides on commands: the hierarchy's high level, or the paper's scripted baseline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc import policies
+from tdgc.config import (
+    CommandRanges,
+    ConfigError,
+    HighLevelConfig,
+    LowLevelConfig,
+    RobotConfig,
+    recorded,
+)
+from tdgc.policies import Policy
+from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array, wrap_angle
+from tdgc.tasks.high_env import SEMANTIC, check_pair, high_layout, observe_high
+from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.teacher import Teacher, toward
+
+
+class Driver(Protocol):
+    """Drives robots to their goals, step by step.
+
+    Attributes:
+        config: the MDP of its decisions; cues "none" where it looks at none.
+        bounds: what its commands stay within.
+        action: (M, 13) of the last decision as the policy gave it; None where none is decoded.
+    """
+
+    config: HighLevelConfig
+    bounds: CommandRanges
+    action: NDArray[np.floating] | None
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        """New episodes for all robots of ``loco``; ``goal`` (M, 2) m in the world."""
+
+    def command(self, step: int) -> Array:
+        """Commands (M, 15) for the coming control step number ``step``."""
+
+
+@dataclass(frozen=True)
+class GoToGoal:
+    """``gp``, the paper's baseline: a scripted law over the same frozen low level.
+
+    Walks in trot with default behaviour parameters, as fast as the distance asks, turning by the
+    heading error, and slows while it faces away. No terrain cues. Gains tuned on training tiles
+    (docs/experiments.md).
+    """
+
+    top_speed: float = 0.6  # m/s
+    distance_gain: float = 1.0  # 1/s
+    heading_gain: float = 1.5  # 1/s
+    swing_height: float = 0.2  # m
+
+    def law(self, position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
+        """Forward speed and yaw rate: positions (M, 2), headings (M,), goals (M, 2)."""
+        offset = goal - position
+        error = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - yaw)
+        distance = np.linalg.norm(offset, axis=1)
+        return toward(distance, error, self.top_speed, self.distance_gain, self.heading_gain)
+
+
+class BaselineDriver:
+    """Drives robots by ``GoToGoal``, anew at every control step; it knows no families."""
+
+    def __init__(self, law: GoToGoal | None = None) -> None:
+        self.law = law or GoToGoal()
+        self.config = HighLevelConfig(cues="none")
+        self.bounds = CommandRanges()
+        self.action: NDArray[np.floating] | None = None
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        self._loco, self._goal = loco, goal
+        self._command = np.tile(default_command(), (loco.num_robots, 1))
+        self._command[:, INDEX["swing_height"]] = self.law.swing_height
+
+    def command(self, step: int) -> Array:
+        state = self._loco.world.state
+        speed, turn = self.law.law(state.position[:, :2], state.yaw, self._goal)
+        self._command[:, INDEX["vx"]], self._command[:, INDEX["yaw_rate"]] = speed, turn
+        return self._command
+
+
+class TeacherDriver:
+    """Drives robots by the scripted teacher, decided as often as the hierarchy decides.
+
+    It is told what the hierarchy has to find out, so it is no rival: it shows what the low level
+    can do when it is told the right thing.
+
+    Args:
+        low, config: the low level, whose leaps are measured first.
+    """
+
+    def __init__(self, low: Policy, config: LowLevelConfig) -> None:
+        self.config = HighLevelConfig(cues="none")
+        self._landing = measure_landing(low, config)
+        self.bounds = CommandRanges()
+        self.action: NDArray[np.floating] | None = None
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        self._loco, self._goal = loco, goal
+        assert loco.world.field is not None  # episodes run on tiles
+        families = [family] * loco.num_robots
+        self._teacher = Teacher(loco.world.field, families, self._landing)
+        self._teacher.begin(np.arange(loco.num_robots), goal)
+
+    def command(self, step: int) -> Array:
+        if step % self.config.decimation == 0:
+            self._command = self._teacher.commands(self._loco, self._goal)
+        return self._command
+
+
+class HierarchyDriver:
+    """Drives robots by the recurrent high level (paper Sec. IV-B), ``tdgc``.
+
+    A decision is deterministic and its commands are held for ``decimation`` control steps.
+
+    Args:
+        high, config: what ``load_high`` returned.
+    """
+
+    def __init__(self, high: Policy, config: HighLevelConfig) -> None:
+        self._high, self.config = high, config
+        self.bounds = config.commands
+        self.action: NDArray[np.floating] | None = None
+        self._decoder = CommandDecoder(config.commands, config.action_limit)
+
+    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+        m, config = loco.num_robots, self.config
+        self._loco, self._goal = loco, goal
+        seen = SEMANTIC.index(family if family in SEMANTIC else "unknown")
+        self._families = np.full(m, seen)
+        self._horizon = round(
+            config.episode_seconds / (config.decimation * loco.physics.control_dt)
+        )
+        self._state: policies.State | None = None
+        self._last = np.zeros((m, NUM_ACTIONS))
+
+    def command(self, step: int) -> Array:
+        decision, held = divmod(step, self.config.decimation)
+        if held == 0:
+            observation = observe_high(
+                self._loco,
+                self._goal,
+                np.full(self._loco.num_robots, decision / self._horizon),
+                self._last,
+                self._families,
+                self.config.cues,
+            )
+            action, self._state = self._high.predict(observation, self._state)
+            self.action, self._last = action, self._decoder.normalise(action)
+            self._command = self._decoder.decode(action)
+        return self._command
+
+
+def load_high(
+    path: str | Path, low: Policy, low_config: LowLevelConfig
+) -> tuple[Policy, HighLevelConfig]:
+    """A high-level policy and the MDP it was trained on, for use on the low level ``low``.
+
+    Raises:
+        ValueError: a file that cannot be used, one that is no high level, or one that was trained
+            on a low level with another robot, observation, control rate or narrower commands; the
+            message names the mismatch.
+    """
+    high = policies.load(path)
+    if high.kind != "lstm" or high.action_dim != NUM_ACTIONS:
+        raise ConfigError(f"{path}: not a high-level policy of this package")
+    try:
+        config = recorded(HighLevelConfig, high.meta["config"], path)
+        trained_on = recorded(LowLevelConfig, high.meta["low"]["config"], f"{path}, meta.low")
+        observation = high.meta["low"]["observation"]
+    except (KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: its meta lacks what it was trained on") from error
+    for field in fields(RobotConfig):
+        wanted, given = (getattr(c.robot, field.name) for c in (trained_on, low_config))
+        if wanted != given:
+            raise ConfigError(
+                f"{path}: trained for a low level with robot.{field.name} {wanted}, not {given}"
+            )
+    size = sum(width for _, width in high_layout(config.cues))
+    for what, wanted, given in (
+        ("a high level that observes {} values", size, high.obs_dim),
+        ("a low level that observes {} values", observation, low.actor_dim),
+        (
+            "a low level with a control step of {} s",
+            trained_on.physics.control_dt,
+            low_config.physics.control_dt,
+        ),
+    ):
+        if wanted != given:
+            raise ConfigError(f"{path}: trained for {what.format(wanted)}, not {given}")
+    check_pair(config, low_config)
+    return high, config

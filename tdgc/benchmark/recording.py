@@ -1,0 +1,149 @@
+"""Recordings: all that is needed to show an episode again, at every control step."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.benchmark.drivers import Driver
+from tdgc.benchmark.evaluation import OUTCOMES, Cell, EpisodeRecord, Watcher
+from tdgc.config import RobotConfig
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.sim.terrain import TileField
+from tdgc.tasks.rewards import CONTACT_FORCE
+
+
+@dataclass(frozen=True, eq=False)
+class Recording(EpisodeRecord):
+    """One episode; row i of the arrays is the robot after control step i of n.
+
+    Attributes:
+        robot: what robot it was.
+        dt: s, a control step.
+        bounds: (12, 2) what its continuous commands stayed within.
+        position, quaternion, q: trunk in the tile's frame, (n, 3) m and (n, 4); joints, (n, 12)
+            rad.
+        command: (n, 15) in force during the step.
+        velocity: (n, 3) forward and left in m/s, yaw rate in rad/s, like the first commands.
+        height: (n,) m, trunk above the support surface under it.
+        contact, desired: (n, 4) feet in contact, and whether the gait desired it.
+    """
+
+    robot: RobotConfig
+    dt: float
+    bounds: Array
+    position: Array
+    quaternion: Array
+    q: Array
+    command: Array
+    velocity: Array
+    height: Array
+    contact: NDArray[np.bool_]
+    desired: NDArray[np.bool_]
+
+    @property
+    def ending(self) -> str:
+        """How and when it ended, for people."""
+        return f"{self.outcome.replace('_', ' ')}, {len(self.command) * self.dt:.1f} s"
+
+
+class Recorder:
+    """A ``Watcher`` that records a cell's first episodes.
+
+    Args:
+        driver: what drives the batch.
+        seed: of the evaluation's tiles.
+        count: episodes with a number below that are recorded.
+    """
+
+    def __init__(self, driver: Driver, seed: int, count: int) -> None:
+        self._driver, self._seed, self._count = driver, seed, count
+
+    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
+        self._cell, self._loco = cell, loco
+        self._rows = np.arange(max(0, min(cell.count, self._count - cell.first)))
+        self._origin = np.zeros((len(self._rows), 3))
+        self._origin[:, :2] = field.origin(self._rows, 0)
+        self._steps = np.zeros(cell.count, dtype=int)
+        self._outcome = np.full(cell.count, -1)
+        self._kept: list[dict[str, NDArray[Any]]] = []
+
+    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+        self._outcome = outcome.copy()
+        self._steps[live] = step + 1
+        rows, loco = self._rows, self._loco
+        if not np.isin(rows, live).any():
+            return
+        world, state = loco.world, loco.world.state
+        support = world.support_height(state.position[rows, 0], state.position[rows, 1])
+        self._kept.append(
+            {
+                "position": state.position[rows] - self._origin,
+                "quaternion": state.quaternion[rows],
+                "q": state.q[rows],
+                "command": loco.command[rows],
+                "velocity": np.column_stack([state.heading_vel[rows, :2], state.ang_vel[rows, 2]]),
+                "height": state.position[rows, 2] - support,
+                "contact": state.foot_force[rows] > CONTACT_FORCE,
+                "desired": loco.clock.contact[rows] > 0.5,
+            }
+        )
+
+    def recordings(self) -> list[Recording]:
+        """The recordings of the batch that was watched last, in order."""
+        cell, loco = self._cell, self._loco
+        bounds = np.array(dataclasses.astuple(self._driver.bounds))
+        result = []
+        for k in self._rows:
+            steps = self._kept[: self._steps[k]]
+            arrays = {key: np.array([step[key][k] for step in steps]) for key in steps[0]}
+            result.append(
+                Recording(
+                    cell.policy,
+                    cell.condition,
+                    cell.family,
+                    cell.level,
+                    cell.first + int(k),
+                    self._seed,
+                    OUTCOMES[self._outcome[k]],
+                    loco.robot,
+                    loco.physics.control_dt,
+                    bounds,
+                    **arrays,
+                )
+            )
+        return result
+
+
+class Together:
+    """Several watchers as one."""
+
+    def __init__(self, watchers: Sequence[Watcher]) -> None:
+        self._watchers = watchers
+
+    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
+        for watcher in self._watchers:
+            watcher.begin(cell, loco, field, goal)
+
+    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+        for watcher in self._watchers:
+            watcher.step(step, live, outcome)
+
+
+def spans(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Runs of True in ``flags`` (n,), as (begin, end) with ``flags[begin:end]`` all True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def stretches(values: NDArray[np.int64]) -> list[tuple[int, int, int]]:
+    """Runs of equal ``values`` (n,), as (begin, end, value) that cover all of it."""
+    cuts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
+    return [(a, b, int(values[a])) for a, b in itertools.pairwise(cuts)]

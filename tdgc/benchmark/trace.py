@@ -1,0 +1,427 @@
+"""Traces: what was decided, when, on which cues, and how it was carried out; a file an episode.
+
+A trace is a table with a row a decision: what the robot and its cues were like, the action, the
+commands it was decoded to, and how the decision before was carried out. A last row holds the end of
+the episode and no decision. ``COLUMNS`` lists all columns, docs/trace.md shows the list.
+
+Files are Parquet with scalar columns only, readable by any tool for tables. What a column means,
+its unit and the episode stand in the file too. They need pyarrow, the extra ``trace``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.benchmark.drivers import Driver
+from tdgc.benchmark.evaluation import OUTCOMES, Cell, EpisodeRecord, joint_power
+from tdgc.errors import InputError, install_hint
+from tdgc.sim.commands import (
+    CONTINUOUS,
+    INDEX,
+    NAMES,
+    NUM_ACTIONS,
+    UNITS,
+    CommandDecoder,
+    gait_index,
+)
+from tdgc.sim.gaits import FEET, GAITS
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.terrain import TileField
+from tdgc.tasks import rewards
+from tdgc.tasks.high_env import PROBES, SEMANTIC, command_share, height_probes, high_step
+from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
+
+FORMAT = "tdgc-trace"
+VERSION = 1
+
+
+class TraceError(InputError):
+    """A trace that cannot be written or read; the message is one line."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a trace; ``unit`` is empty for a column of names."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+#: Commands that a body can be measured against; the others shape feet, contacts or power.
+TRACKED = ("vx", "vy", "yaw_rate", "body_height", "pitch", "roll")
+_ACTIONS = tuple(f"action_{name}" for name in (*CONTINUOUS, "gait"))
+_COMMANDS = tuple(f"command_{name}" for name in NAMES)
+_AT_BOUND = tuple(f"at_bound_{name}" for name in CONTINUOUS)
+_PROBES = tuple(f"probe_{i:02d}" for i in range(len(PROBES)))
+_REWARDS = tuple(f"reward_{name}" for name in HIGH_TERMS)
+
+
+def _columns() -> Iterator[Column]:
+    yield Column("time", "s", "since the start of the episode")
+    yield Column("base_x", "m", "trunk along the tile, 0 where the tile begins")
+    yield Column("base_y", "m", "trunk across the tile, 0 at its right border")
+    yield Column("base_z", "m", "trunk above the platforms")
+    yield Column("base_height", "m", "trunk above the support surface under it")
+    yield Column("yaw", "rad", "heading, 0 along the tile, to the left positive")
+    yield Column("pitch", "rad", "of the trunk, nose down positive")
+    yield Column("roll", "rad", "of the trunk, left side up positive")
+    yield Column("goal_distance", "m", "from the trunk to the goal")
+    yield Column("goal_bearing", "rad", "of the goal against the heading, to the left positive")
+    yield Column("family", "", "cue: the terrain family that the high level was told")
+    for name, (x, y) in zip(_PROBES, PROBES, strict=True):
+        where = f"({x:g}, {y:g}) m ahead and to the left"
+        yield Column(name, "m", f"cue: ground {where}, against where a standing robot's would be")
+    for name in _ACTIONS:
+        yield Column(name, "1", "action of the policy, before it is decoded")
+    for name, unit in zip(NAMES, UNITS, strict=True):
+        yield Column(f"command_{name}", unit, "command, as the low level got it")
+    yield Column("gait", "", "gait commanded")
+    for name in CONTINUOUS:
+        yield Column(f"at_bound_{name}", "1", "-1 or 1: at its lower or upper bound")
+    yield Column("seconds", "s", "since the decision before; the columns below look back on them")
+    for name in TRACKED:
+        unit = UNITS[INDEX[name]]
+        yield Column(f"error_{name}", unit, "mean of what was measured less what was commanded")
+    for foot in FEET:
+        yield Column(f"contact_{foot}", "1", "share of the time in contact")
+    for foot in FEET:
+        yield Column(f"match_{foot}", "1", "share of the time in contact as the gait desired")
+    yield Column("trunk_force", "N", "largest normal force on the trunk")
+    yield Column("leg_force", "N", "largest normal force on a leg above its foot")
+    yield Column("power", "W", "mean of the sum of |torque x speed| of the joints")
+    for name in _REWARDS:
+        yield Column(name, "1", "term of the high level's reward, weighted")
+
+
+#: All columns in order. Numbers are float32. A value that there is none of is null: decisions in
+#: the last row, looks back in the first, actions and cues of a driver that has none, reward terms
+#: without a weight.
+COLUMNS: tuple[Column, ...] = tuple(_columns())
+_TEXT = tuple(c.name for c in COLUMNS if not c.unit)
+_DECIDED = (*_ACTIONS, *_COMMANDS, "gait", *_AT_BOUND)
+
+
+@dataclass(frozen=True, eq=False)
+class Trace(EpisodeRecord):
+    """One episode's trace.
+
+    Attributes:
+        columns: name -> (n,) float32, or str and None in columns of names; n - 1 decisions and the
+            end. NaN stands for null.
+    """
+
+    columns: dict[str, NDArray[Any]]
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self.columns[name]
+
+    @property
+    def file_name(self) -> str:
+        """Its file's name."""
+        return f"{self.name}.parquet"
+
+
+_META = tuple(f for f in dataclasses.fields(Trace) if f.name != "columns")
+
+
+class Tracer:
+    """A ``Watcher`` that keeps a trace of every episode of a batch.
+
+    Args:
+        driver: what drives the batch.
+        seed: of the evaluation's tiles.
+    """
+
+    def __init__(self, driver: Driver, seed: int) -> None:
+        self._driver, self._seed = driver, seed
+
+    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
+        m, config = loco.num_robots, self._driver.config
+        self._cell, self._loco, self._goal = cell, loco, goal
+        self._origin = field.origin(np.arange(m), 0)
+        self._dt = loco.physics.control_dt
+        self._hold = config.decimation
+        self._horizon = round(config.episode_seconds / (self._hold * self._dt))
+        self._decoder = CommandDecoder(config.commands, config.action_limit)
+        middle = command_share(self._decoder.decode(np.zeros(NUM_ACTIONS)), self._decoder)
+        self._shares = np.tile(middle, (3, m, 1))
+        self._actions = np.zeros((2, m, NUM_ACTIONS))
+        self._steps = np.zeros(m, dtype=int)
+        self._decisions = np.zeros(m, dtype=int)
+        self._outcome = np.full(m, -1)
+        self._rows: list[dict[str, NDArray[Any]]] = []
+        self._clear()
+        self._look()
+
+    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+        if step % self._hold == 0:
+            self._decide(live)
+        self._measure(live)
+        self._outcome = outcome.copy()
+        if (step + 1) % self._hold == 0:
+            self._look()
+
+    def traces(self) -> list[Trace]:
+        """The traces of the batch that was watched last, in order."""
+        if self._count.any():  # all ended between two decisions
+            self._look()
+        cell, result = self._cell, []
+        for k in range(cell.count):
+            rows = self._rows[: self._decisions[k] + 1]
+            columns: dict[str, NDArray[Any]] = {}
+            for c in COLUMNS:
+                kind = object if c.name in _TEXT else np.float32
+                columns[c.name] = np.array([row[c.name][k] for row in rows], dtype=kind)
+                if c.name in _DECIDED:  # a fellow robot's decision was noted beside its end
+                    columns[c.name][-1] = None if kind is object else np.nan
+            place = (cell.policy, cell.condition, cell.family, cell.level, cell.first + k)
+            result.append(Trace(*place, self._seed, OUTCOMES[self._outcome[k]], columns))
+        return result
+
+    # ------------------------------------------------------------------ a row
+
+    def _clear(self) -> None:
+        m = self._loco.num_robots
+        self._count = np.zeros(m)
+        self._error = np.zeros((m, len(TRACKED)))
+        self._contact, self._match = np.zeros((m, 4)), np.zeros((m, 4))
+        self._power, self._force = np.zeros(m), np.zeros((m, 5))
+
+    def _decide(self, live: NDArray[np.intp]) -> None:
+        """Note the decision that was just taken in the row of what it was taken on."""
+        row, command, driver = self._rows[-1], self._loco.command, self._driver
+        self._decisions[live] += 1
+        if driver.action is not None:
+            row.update(zip(_ACTIONS, driver.action.T.copy(), strict=True))
+            self._actions = np.stack([self._decoder.normalise(driver.action), self._actions[0]])
+        row.update(zip(_COMMANDS, command.T.copy(), strict=True))
+        row["gait"] = np.array(GAITS, dtype=object)[gait_index(command)]
+        for name, j in zip(CONTINUOUS, range(len(CONTINUOUS)), strict=True):
+            low, high = getattr(driver.bounds, name)
+            rounding = 1e-9 * (high - low)
+            at = (command[:, j] >= high - rounding).astype(float)
+            row[f"at_bound_{name}"] = at - (command[:, j] <= low + rounding)
+        share = command_share(command, self._decoder)
+        self._shares = np.concatenate([share[None], self._shares[:-1]])
+        self._clear()
+
+    def _measure(self, live: NDArray[np.intp]) -> None:
+        """Look at a control step of the robots that are still going."""
+        loco = self._loco
+        state = loco.world.state
+        pitch, roll = self._tilt()
+        measured = np.stack(
+            [*state.heading_vel[:, :2].T, state.ang_vel[:, 2], self._height(), pitch, roll], axis=1
+        )
+        measured[:, 3] -= loco.robot.base_height  # the command adds to it
+        wanted = loco.command[:, [INDEX[name] for name in TRACKED]]
+        touching = state.foot_force > CONTACT_FORCE
+        self._steps[live] += 1
+        self._count[live] += 1.0
+        self._error[live] += (measured - wanted)[live]
+        self._contact[live] += touching[live]
+        self._match[live] += (touching == (loco.clock.contact > 0.5))[live]
+        self._power[live] += joint_power(state)[live]
+        force = np.column_stack([state.trunk_force, state.leg_force])
+        self._force[live] = np.maximum(self._force[live], force[live])
+
+    def _look(self) -> None:
+        """A new row: what things are like now, and how the decision before was carried out."""
+        state, offset = self._loco.world.state, self._goal - self._loco.world.state.position[:, :2]
+        nothing = np.full(self._loco.num_robots, np.nan)
+        row: dict[str, NDArray[Any]] = {
+            c.name: nothing if c.unit else np.full(len(nothing), None, object) for c in COLUMNS
+        }
+        row["time"] = self._dt * self._steps
+        row["base_x"], row["base_y"] = (state.position[:, :2] - self._origin).T
+        row["base_z"], row["base_height"] = state.position[:, 2].copy(), self._height()
+        row["yaw"] = state.yaw.copy()
+        row["pitch"], row["roll"] = self._tilt()
+        row["goal_distance"] = np.linalg.norm(offset, axis=1)
+        row["goal_bearing"] = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
+        self._add_cues(row)
+        if self._count.any():
+            self._add_execution(row)
+        self._rows.append(row)
+        self._count[:] = 0.0
+
+    def _add_cues(self, row: dict[str, NDArray[Any]]) -> None:
+        cues, family = self._driver.config.cues, self._cell.family
+        if cues in ("both", "semantic"):
+            told = family if family in SEMANTIC else "unknown"
+            row["family"] = np.full(self._loco.num_robots, told, object)
+        if cues in ("both", "geometric"):
+            row.update(zip(_PROBES, height_probes(self._loco).T, strict=True))
+
+    def _add_execution(self, row: dict[str, NDArray[Any]]) -> None:
+        count = np.where(self._count > 0.0, self._count, np.nan)  # some ended long ago
+        row["seconds"] = self._dt * count
+        for k, name in enumerate(TRACKED):
+            row[f"error_{name}"] = self._error[:, k] / count
+        for k, foot in enumerate(FEET):
+            row[f"contact_{foot}"] = self._contact[:, k] / count
+            row[f"match_{foot}"] = self._match[:, k] / count
+        row["trunk_force"], row["leg_force"] = self._force[:, 0], self._force[:, 1:].max(axis=1)
+        row["power"] = self._power / count
+        # As in training, where a decision that ends early is paid for all of its time.
+        config = self._driver.config.rewards
+        share = len(self._rows) / self._horizon
+        seen = high_step(
+            self._loco, self._goal, share, self._actions, self._shares, self._force, config
+        )
+        for name, value in rewards.high_terms(seen, self._hold * self._dt).items():
+            if name != "action_rate" or self._driver.action is not None:
+                row[f"reward_{name}"] = value
+
+    def _height(self) -> Array:
+        world = self._loco.world
+        x, y, z = world.state.position.T
+        return np.asarray(z - world.support_height(x, y))
+
+    def _tilt(self) -> tuple[Array, Array]:
+        """Pitch and roll, (M,) rad each: what ``rewards.commanded_gravity`` makes gravity of."""
+        x, y, z = self._loco.world.state.gravity.T
+        return np.arcsin(np.clip(x, -1.0, 1.0)), np.arctan2(-y, -z)
+
+
+# ---------------------------------------------------------------------------- files
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which traces are written: all, those that failed, or the first so many of each cell."""
+
+    which: Literal["all", "failed"] | int
+
+    @classmethod
+    def parse(cls, text: str) -> Selection:
+        """``all``, ``failed`` or a number.
+
+        Raises:
+            TraceError: something else.
+        """
+        if text == "all":
+            return cls("all")
+        if text == "failed":
+            return cls("failed")
+        if not (text.isascii() and text.isdigit() and int(text[:9]) > 0):
+            raise TraceError(f"--trace must be all, failed or a number from 1, not '{text}'")
+        return cls(int(text[:9]))  # more than any evaluation has
+
+    def includes(self, trace: Trace) -> bool:
+        if isinstance(self.which, int):
+            return trace.episode < self.which
+        return self.which == "all" or trace.outcome != "reached"
+
+
+def check_installed() -> None:
+    """Refuse to go on without pyarrow.
+
+    Raises:
+        TraceError: it is not installed; the message says what to install.
+    """
+    if importlib.util.find_spec("pyarrow") is None:
+        raise TraceError(f"traces need pyarrow: {install_hint('trace')}")
+
+
+def _fields() -> list[tuple[str, Any, dict[str, str]]]:
+    """Name, type and metadata of each column in a file."""
+    import pyarrow as pa
+
+    return [
+        (
+            c.name,
+            pa.float32() if c.unit else pa.string(),
+            {"unit": c.unit, "description": c.meaning},
+        )
+        for c in COLUMNS
+    ]
+
+
+def _about(field: Any) -> dict[str, str]:
+    """Unit and description of a column in a file, as far as it has them."""
+    found = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+    return {key: found[key] for key in ("unit", "description") if key in found}
+
+
+def write(trace: Trace, folder: str | Path) -> Path:
+    """Write ``trace`` into ``folder`` under its ``file_name``, whole or not at all; its path."""
+    check_installed()
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    fields = [pa.field(name, kind, metadata=about) for name, kind, about in _fields()]
+    arrays = [pa.array(trace[f.name], f.type, from_pandas=True) for f in fields]
+    meta = {"format": FORMAT, "version": str(VERSION)}
+    meta |= {f.name: str(getattr(trace, f.name)) for f in _META}
+    table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=meta))
+    path = Path(folder) / trace.file_name
+    partial = path.with_suffix(f".{os.getpid()}.tmp")
+    try:
+        pq.write_table(
+            table,
+            partial,
+            compression="zstd",
+            use_dictionary=list(_TEXT),
+            use_byte_stream_split=[c.name for c in COLUMNS if c.unit],  # a fifth smaller
+            write_statistics=False,
+            write_page_checksum=True,
+        )
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def read(path: str | Path) -> Trace:
+    """The trace in a file that ``write`` wrote.
+
+    Raises:
+        TraceError: no such file, one that is damaged, no trace, or of another version.
+    """
+    check_installed()
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = Path(path)
+    if not path.is_file():
+        raise TraceError(f"{path}: no such file")
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            raw = file.schema_arrow.metadata or {}
+            meta = {key.decode(): value.decode() for key, value in raw.items()}
+            fields = [(f.name, f.type, _about(f)) for f in file.schema_arrow]
+            known = (meta.get("format"), meta.get("version"), fields)
+            table = file.read() if known == (FORMAT, str(VERSION), _fields()) else None
+            if table is not None:
+                table.validate(full=True)  # that its names are UTF-8, among others
+    except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
+        raise TraceError(f"{path}: damaged, or not a Parquet file") from error
+    if meta.get("format") != FORMAT:
+        raise TraceError(f"{path}: not a trace of this package")
+    if meta.get("version") != str(VERSION):
+        raise TraceError(
+            f"{path}: a trace of version {meta.get('version')}, this package reads {VERSION}"
+        )
+    if table is None or table.num_rows < 2:
+        raise TraceError(f"{path}: its columns are not those of a trace of version {VERSION}")
+    try:
+        head = {f.name: int(meta[f.name]) if f.type == "int" else meta[f.name] for f in _META}
+    except (KeyError, ValueError) as error:
+        raise TraceError(f"{path}: does not say which episode it is of") from error
+    columns = {c.name: table[c.name].to_numpy(zero_copy_only=False) for c in COLUMNS}
+    trace = Trace(**head, columns=columns)  # type: ignore[arg-type]
+    if "\0" in trace.file_name or Path(trace.file_name).name != trace.file_name:
+        raise TraceError(f"{path}: of an episode '{trace.file_name}', which cannot name a file")
+    return trace

@@ -1,0 +1,281 @@
+"""Tuning at deployment: narrower commands, fewer gaits, another decision rate, safety limits.
+
+The commands between the two levels can be limited without any training. A bound clips a command
+and does not rescale it: an action goes on to mean what it meant to the policy, and only what lies
+beyond the bound changes. In JSON, all keys optional:
+
+    {
+      "decoder": {"vx": {"low": -0.2, "high": 0.6}, "gaits": ["trot", "bound"]},
+      "decision_rate": 5,
+      "safety": {"max_tilt": 0.5, "max_speed": 0.6}
+    }
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.benchmark.drivers import HierarchyDriver
+from tdgc.benchmark.evaluation import Episode, success
+from tdgc.config import (
+    CommandRanges,
+    ConfigError,
+    HighLevelConfig,
+    LowLevelConfig,
+    from_dict,
+    read_json,
+    to_dict,
+    with_overrides,
+)
+from tdgc.policies import Policy
+from tdgc.sim.commands import CONTINUOUS, INDEX
+from tdgc.sim.gaits import GAITS, gait_embedding
+from tdgc.sim.robot import Array
+
+_VELOCITIES = ("vx", "vy", "yaw_rate")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds of one command, in its unit; None leaves the policy's own."""
+
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class DecoderTuning:
+    """Bounds that clip the decoder's commands, and the gaits allowed."""
+
+    vx: Limits = Limits()
+    vy: Limits = Limits()
+    yaw_rate: Limits = Limits()
+    body_height: Limits = Limits()
+    frequency: Limits = Limits()
+    duration: Limits = Limits()
+    swing_height: Limits = Limits()
+    pitch: Limits = Limits()
+    roll: Limits = Limits()
+    stance_width: Limits = Limits()
+    stance_length: Limits = Limits()
+    power_weight: Limits = Limits()
+    gaits: tuple[str, ...] = GAITS
+
+
+@dataclass(frozen=True)
+class SafetyTuning:
+    """Limits that slow a robot down at every control step, after all bounds.
+
+    Attributes:
+        max_tilt: rad between the trunk and level ground. Tilted by more, the robot is asked for
+            max_tilt / tilt of the velocity and yaw rate.
+        max_speed: m/s. A faster planar velocity is shortened to it and keeps its direction.
+    """
+
+    max_tilt: float | None = None
+    max_speed: float | None = None
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What may be changed at deployment; ``decision_rate`` in Hz."""
+
+    decoder: DecoderTuning = DecoderTuning()
+    decision_rate: float | None = None
+    safety: SafetyTuning = SafetyTuning()
+
+
+def load(path: str | Path | None, assignments: Iterable[str] = ()) -> Tuning:
+    """The tuning in a JSON file, with ``key=value`` strings applied on top.
+
+    Raises:
+        ConfigError: a file that cannot be read or is no JSON, an unknown key or one that stands
+            twice, a value of the wrong type, NaN or infinite; the message is one line.
+    """
+    data = {} if path is None else read_json(Path(path))
+    return with_overrides(from_dict(Tuning, data), assignments)
+
+
+def tuned_ranges(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> CommandRanges:
+    """The bounds that a tuned policy's commands stay within.
+
+    Args:
+        tuning: the changes.
+        config: of the high level that is tuned.
+        low: of the low level, whose ``commands`` are what it was trained on.
+
+    Raises:
+        ConfigError: a bound outside what the low level was trained on, one that is wider than the
+            policy's own, so that it would change nothing, or a lower bound above its upper one.
+    """
+    ranges = {}
+    for name in CONTINUOUS:
+        limits: Limits = getattr(tuning.decoder, name)
+        trained, own = getattr(low.commands, name), getattr(config.commands, name)
+        for side in ("low", "high"):
+            value = getattr(limits, side)
+            what = f"decoder.{name}.{side}={value}"
+            if value is not None and not trained[0] <= value <= trained[1]:
+                raise ConfigError(f"{what}: the low level was trained on {list(trained)}")
+            if value is not None and not own[0] <= value <= own[1]:
+                raise ConfigError(f"{what}: a bound can only narrow the policy's {list(own)}")
+        bottom = own[0] if limits.low is None else limits.low
+        top = own[1] if limits.high is None else limits.high
+        if bottom > top:
+            raise ConfigError(f"decoder.{name}: the lower bound {bottom} is above the upper {top}")
+        ranges[name] = (bottom, top)
+    return CommandRanges(**ranges)
+
+
+def tuned_decimation(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> int:
+    """Control steps a decision is held.
+
+    Raises:
+        ConfigError: a rate that does not divide the control rate, or less than one decision an
+            episode.
+    """
+    if tuning.decision_rate is None:
+        return config.decimation
+    control = 1.0 / low.physics.control_dt
+    steps = control / tuning.decision_rate if tuning.decision_rate > 0.0 else 0.0
+    most = round(config.episode_seconds * control)
+    if not 1 <= round(min(steps, most + 1)) <= most or abs(steps - round(steps)) > 1e-9 * steps:
+        raise ConfigError(
+            f"decision_rate={tuning.decision_rate} Hz must be the control rate of {control:g} Hz "
+            f"divided by a whole number from 1 to {most}"
+        )
+    return round(steps)
+
+
+def check(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> None:
+    """Refuse a tuning that cannot be used with these policies, or that changes nothing.
+
+    Raises:
+        ConfigError: says which key, and what is allowed.
+    """
+    ranges, decimation = tuned_ranges(tuning, config, low), tuned_decimation(tuning, config, low)
+    gaits, safety = tuning.decoder.gaits, tuning.safety
+    if not gaits or len(set(gaits)) < len(gaits) or not set(gaits) <= set(GAITS):
+        raise ConfigError(
+            f"decoder.gaits must name some of {', '.join(GAITS)}, each once, not {list(gaits)}"
+        )
+    for name, value in dataclasses.asdict(safety).items():
+        if value is not None and not value > 0.0:
+            raise ConfigError(f"safety.{name} must be positive, not {value}")
+        for command in _VELOCITIES:
+            bottom, top = getattr(low.commands, command)
+            if value is not None and not bottom <= 0.0 <= top:
+                raise ConfigError(
+                    f"safety.{name} slows down to 0: the low level was trained on {command} from "
+                    f"{bottom} to {top}"
+                )
+    same = (
+        ranges == config.commands and decimation == config.decimation and safety == SafetyTuning()
+    )
+    if same and set(gaits) == set(GAITS):
+        raise ConfigError("the tuning changes nothing")
+
+
+class TunedDriver(HierarchyDriver):
+    """``HierarchyDriver`` within a tuning's limits, ``tdgc-tuned``.
+
+    The policy goes on to see its own last action. Where the gait that it picks is not allowed, the
+    robot takes the allowed one that is nearest on the action's gait channel: the least change of
+    the action that is allowed.
+
+    Args:
+        high, config: what ``load_high`` returned.
+        low: the low level's MDP.
+        tuning: the limits.
+
+    Raises:
+        ConfigError: limits that cannot be used, see ``check``.
+    """
+
+    def __init__(
+        self, high: Policy, config: HighLevelConfig, low: LowLevelConfig, tuning: Tuning
+    ) -> None:
+        check(tuning, config, low)
+        hold = tuned_decimation(tuning, config, low)
+        super().__init__(high, dataclasses.replace(config, decimation=hold))
+        self.bounds = tuned_ranges(tuning, config, low)
+        self._bounds = np.array(dataclasses.astuple(self.bounds)).T
+        self._gaits = np.array(sorted(GAITS.index(name) for name in tuning.decoder.gaits))
+        self._safety = tuning.safety
+
+    def command(self, step: int) -> Array:
+        command = super().command(step).copy()
+        command[:, :12] = np.clip(command[:, :12], *self._bounds)
+        assert self.action is not None
+        command[:, 12:] = gait_embedding(self._nearest_gait(self.action))
+        self._slow_down(command)
+        return command
+
+    def _nearest_gait(self, action: NDArray[np.floating]) -> NDArray[np.int64]:
+        chosen = self._decoder.gait(action)
+        place = 2.0 * (self._decoder.normalise(action)[:, -1:] + 1.0)  # gait i from i to i + 1
+        away = np.maximum(self._gaits - place, place - (self._gaits + 1.0))
+        nearest = self._gaits[np.argmin(away, axis=1)]
+        return np.where(np.isin(chosen, self._gaits), chosen, nearest)
+
+    def _slow_down(self, command: Array) -> None:
+        """Apply the safety limits to commands (M, 15), in place."""
+        planar, turning = [INDEX["vx"], INDEX["vy"]], [INDEX[name] for name in _VELOCITIES]
+        if self._safety.max_speed is not None:
+            speed = np.linalg.norm(command[:, planar], axis=1, keepdims=True)
+            command[:, planar] *= self._safety.max_speed / np.maximum(speed, self._safety.max_speed)
+        if self._safety.max_tilt is not None:
+            down = -self._loco.world.state.gravity[:, 2:]
+            tilt = np.arccos(np.clip(down, -1.0, 1.0))
+            command[:, turning] *= self._safety.max_tilt / np.maximum(tilt, self._safety.max_tilt)
+
+
+# ---------------------------------------------------------------------------- what it changed
+
+
+def compare(episodes: Sequence[Episode], before: str, after: str) -> dict[str, Any]:
+    """Two policies on the same tiles: condition -> policy -> figures, and what changed.
+
+    Figures are ``success`` and, over all of a policy's episodes together, ``mean_speed`` in m/s
+    along the path and ``energy_per_metre`` in J (None where nothing moved). ``gained`` counts the
+    tiles that only ``after`` reached the goal on, ``lost`` those that only ``before`` did.
+    """
+    result: dict[str, Any] = {}
+    for condition in dict.fromkeys(e.condition for e in episodes):
+        found: dict[str, Any] = {}
+        reached = []
+        for policy in (before, after):
+            rows = [e for e in episodes if (e.condition, e.policy) == (condition, policy)]
+            path = sum(e.path_m for e in rows)
+            found[policy] = success(rows) | {
+                "mean_speed": path / sum(e.time_s for e in rows),
+                "energy_per_metre": sum(e.energy_j for e in rows) / path if path > 0.0 else None,
+            }
+            reached.append({(e.family, e.level, e.episode) for e in rows if e.outcome == "reached"})
+        found["gained"], found["lost"] = len(reached[1] - reached[0]), len(reached[0] - reached[1])
+        result[condition] = found
+    return result
+
+
+def record(tuning: Tuning) -> dict[str, Any]:
+    """What a tuning changes, as JSON: the keys that differ from their defaults."""
+
+    def changed(now: dict[str, Any], default: dict[str, Any]) -> dict[str, Any]:
+        kept = {}
+        for key, value in now.items():
+            if isinstance(value, dict):
+                value = changed(value, default[key])
+                if value:
+                    kept[key] = value
+            elif value != default[key]:
+                kept[key] = value
+        return kept
+
+    return changed(to_dict(tuning), to_dict(Tuning()))

@@ -1,0 +1,3 @@
+from tdgc.sim.commands import CommandDecoder
+
+__all__ = ["CommandDecoder"]

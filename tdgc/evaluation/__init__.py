@@ -1,0 +1,3 @@
+from tdgc.benchmark.evaluation import Cell, run_cell
+
+__all__ = ["Cell", "run_cell"]

@@ -1,0 +1,3 @@
+from tdgc.sim.gaits import GAITS, PhaseClock
+
+__all__ = ["GAITS", "PhaseClock"]

@@ -1,0 +1,1 @@
+"""Learning: run folder and loop, the recurrent policy, imitation."""

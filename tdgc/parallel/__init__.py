@@ -1,0 +1,1 @@
+"""Many robots at once: worker processes, on this machine or on a cluster."""

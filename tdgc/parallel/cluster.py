@@ -1,0 +1,301 @@
+"""Workers on more than one machine: actors and tasks of Ray, the extra ``cluster``.
+
+Ray runs on each machine already, see docs/scaling.md. This process joins it, and Ray decides which
+machine a worker or a batch of episodes goes to. Nothing else here knows Ray, and nothing imports
+it before it is asked for.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import itertools
+import logging
+import os
+import re
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc import __version__
+from tdgc.errors import InputError, install_hint
+from tdgc.parallel.worker import BLAS_THREADS, Beginning, MakeTask, Worker, WorkerError, keep_memory
+from tdgc.state import State, copies
+
+_REACH_SECONDS = 5.0  # to be let in by the cluster
+_JOIN_SECONDS = 120.0  # for every node to start a Python and import this package
+_RERUNS = 3  # of a job whose node was lost
+# Of a worker that was lost before it said a word: for some seconds Ray still sends workers to a
+# node that is gone.
+_RESTARTS, _PAUSE_SECONDS = 10, 1.0
+
+#: Of the flag ``--cluster``.
+CLUSTER_HELP = (
+    "simulate in this cluster of Ray: host:port, or auto for the one that RAY_ADDRESS names or "
+    "that runs on this machine"
+)
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+
+class ClusterError(InputError):
+    """A cluster that cannot be used; the message is one line."""
+
+
+def connect(address: str) -> int:
+    """Join a running cluster, unless this process has joined one already.
+
+    Args:
+        address: ``host:port``; or ``auto`` for the one that the variable ``RAY_ADDRESS`` names,
+            or without it the one that was started on this machine.
+
+    Returns:
+        CPUs of the cluster.
+
+    Raises:
+        ClusterError: Ray is not installed, no cluster answers, or a node cannot be used.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise ClusterError(f"--cluster needs Ray: {install_hint('cluster')}")
+    import ray
+
+    if not ray.is_initialized():
+        _join(address)
+        try:
+            _check_nodes()
+        except ClusterError:
+            ray.shutdown()
+            raise
+    return int(ray.cluster_resources().get("CPU", 0))
+
+
+def check_workers(workers: int, cpus: int) -> None:
+    """See that each of ``workers`` finds one of the cluster's ``cpus``: others would wait for ever.
+
+    Raises:
+        ClusterError: there are too few.
+    """
+    if workers > cpus:
+        raise ClusterError(f"the cluster's {cpus} CPUs are too few for {workers} workers")
+
+
+def _join(address: str) -> None:
+    import ray
+    from ray._private.services import canonicalize_bootstrap_address_or_die, extract_ip_port
+
+    try:
+        found = canonicalize_bootstrap_address_or_die(address)
+        # Ray itself would wait for many minutes for a cluster that is gone.
+        socket.create_connection(extract_ip_port(found), _REACH_SECONDS).close()
+    except (OSError, ValueError):
+        raise ClusterError(
+            f"--cluster {address}: no cluster of Ray answers; allowed: host:port, or auto for the "
+            "one that RAY_ADDRESS names or that runs on this machine"
+        ) from None
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(
+            address=address,
+            runtime_env={"env_vars": dict.fromkeys(BLAS_THREADS, "1")},  # see one_blas_thread
+            log_to_driver=False,
+            logging_level=logging.WARNING,
+        )
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ClusterError(f"--cluster {address}: cannot be joined: {reason}") from error
+    finally:
+        signal.signal(signal.SIGTERM, before)  # which Ray has replaced
+
+
+def _check_nodes() -> None:
+    """See that this package has the same version on every node.
+
+    Raises:
+        ClusterError: it has not, is missing, or the node does not answer.
+    """
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    def version() -> str:  # within a function, so that a node without the package can run it
+        import tdgc
+
+        return tdgc.__version__
+
+    for name, answer in [
+        (
+            node["NodeManagerAddress"],
+            ray.remote(version)
+            .options(
+                num_cpus=0,
+                max_retries=0,
+                scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False),
+            )
+            .remote(),
+        )
+        for node in ray.nodes()
+        if node["Alive"]
+    ]:
+        try:
+            found = ray.get(answer, timeout=_JOIN_SECONDS)
+        except ImportError:
+            raise ClusterError(f"tdgc is not installed on node {name}") from None
+        except ray.exceptions.RayError as error:
+            raise ClusterError(f"node {name} gives no answer ({type(error).__name__})") from error
+        if found != __version__:
+            raise ClusterError(f"node {name} has tdgc {found}, this machine {__version__}")
+
+
+# ---------------------------------------------------------------------------- workers
+
+
+class _Actor:
+    """A worker on some node. Its answers are (answer, arrays that it changed, pid, address)."""
+
+    def start(
+        self,
+        make_task: MakeTask,
+        views: dict[str, NDArray[Any]],
+        seed: int,
+        state: State | None,
+    ) -> tuple[Any, ...]:
+        self._views = copies(views)
+        self._worker = Worker(make_task, self._views, seed, state)
+        return self._reply(self._worker.task.state_dict(), "obs")
+
+    def answer(self, word: str, argument: Any) -> tuple[Any, ...]:
+        if word != "step":
+            return self._reply(self._worker.answer(word, argument), "obs")
+        self._views["actions"][:] = argument
+        self._worker.answer(word)
+        return self._reply(None, "obs", "rewards", "terminated", "truncated")
+
+    def _reply(self, answer: Any, *changed: str) -> tuple[Any, ...]:
+        import ray
+
+        arrays = {name: self._views[name] for name in changed}
+        if "terminated" in arrays:
+            arrays["last_obs"] = self._views["last_obs"][_ended(arrays)]  # few, so few bytes
+        return answer, arrays, os.getpid(), ray.util.get_node_ip_address()
+
+
+def _ended(views: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Whose episode ended in the step, (M,)."""
+    return np.asarray((views["terminated"] | views["truncated"]) != 0)
+
+
+class ActorLink:
+    """A worker in an actor of Ray, on whichever node has a CPU to spare.
+
+    A message carries the arrays of all of its robots. Ray's own restarts are off: a worker that
+    is lost is told of, so that whoever has the link starts another one.
+
+    Args:
+        worker: its number.
+        beginning: what it begins with.
+    """
+
+    def __init__(self, worker: int, beginning: Beginning) -> None:
+        self._worker, self._beginning = worker, beginning
+        self._views = beginning.views()
+        self._pid, self._place = 0, "no node yet"
+        self._restarts = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        import ray
+
+        begin = self._beginning
+        self._actor = (
+            ray.remote(_Actor)
+            .options(num_cpus=1, max_restarts=0, scheduling_strategy="SPREAD")
+            .remote()
+        )
+        self._reply = self._actor.start.remote(
+            begin.make_task, self._views, begin.seed, begin.state
+        )
+
+    @property
+    def pid(self) -> int:
+        assert self._pid, "a worker has a process from its first answer on"
+        return self._pid
+
+    def send(self, word: str, argument: Any = None) -> None:
+        if word == "step":
+            argument = self._views["actions"]
+        self._reply = self._actor.answer.remote(word, argument)
+
+    def receive(self, timeout: float) -> Any:
+        import ray
+
+        name = f"worker {self._worker}"
+        try:
+            answer, arrays, self._pid, address = ray.get(self._reply, timeout=timeout)
+        except ray.exceptions.GetTimeoutError:
+            raise WorkerError(f"{name} gave no answer for {timeout:g} s") from None
+        except ray.exceptions.RayTaskError as error:
+            plain = re.sub(r"\x1b\[\d+m", "", str(error))  # without colours
+            raise WorkerError(f"{name} failed:\n{plain}") from None
+        except ray.exceptions.RayError as error:
+            if not self._pid and self._restarts < _RESTARTS:
+                self._restarts += 1
+                time.sleep(_PAUSE_SECONDS)
+                self._begin()
+                return self.receive(timeout)
+            kind = type(error).__name__
+            raise WorkerError(f"{name} was lost with {self._place} ({kind})") from None
+        self._place = f"process {self._pid} on {address}"
+        if "last_obs" in arrays:
+            self._views["last_obs"][_ended(arrays)] = arrays.pop("last_obs")
+        for key, array in arrays.items():
+            self._views[key][:] = array
+        return copy.deepcopy(answer)  # what Ray gives cannot be written to
+
+    def end(self, timeout: float) -> None:
+        import ray
+
+        ray.wait([self._reply], timeout=timeout)
+        ray.kill(self._actor)
+
+
+# ---------------------------------------------------------------------------- jobs
+
+
+def _run(work: Callable[[Job], Result], job: Job) -> Result:
+    keep_memory()
+    return work(job)
+
+
+def spread(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
+    """``work`` on each job, in order, on ``workers`` CPUs of the cluster at most.
+
+    A job whose node is lost is done again on another one.
+
+    Raises:
+        WorkerError: a job was lost too often.
+    """
+    import ray
+
+    run = ray.remote(_run).options(num_cpus=1, max_retries=_RERUNS, scheduling_strategy="SPREAD")
+    shared = ray.put(work)
+    rest = iter(enumerate(jobs))
+    running: dict[Any, int] = {}  # answer to be -> number of the job
+    done: dict[int, Result] = {}
+    for wanted in range(len(jobs)):
+        while wanted not in done:
+            for number, job in itertools.islice(rest, workers - len(running)):
+                running[run.remote(shared, job)] = number
+            (answer,), _ = ray.wait(list(running))
+            try:
+                done[running.pop(answer)] = ray.get(answer)
+            except ray.exceptions.RayTaskError:
+                raise  # the job's own error
+            except ray.exceptions.RayError as error:
+                kind = type(error).__name__
+                raise WorkerError(f"a job was lost {_RERUNS + 1} times ({kind})") from error
+        yield done.pop(wanted)

@@ -1,0 +1,102 @@
+"""Robots of several tasks in one worker, as one task.
+
+So some can be on a plane, where a control step costs less than half, while others are on terrain;
+and however many workers there are, each has its share of both.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.parallel.worker import Task
+from tdgc.sim.robot import Array
+from tdgc.state import State
+
+
+class TaskGroup:
+    """Several tasks as one (``tdgc.parallel.worker.Task``): the robots of the first, then of the
+    next.
+
+    Args:
+        tasks: of one action space and one observation space.
+    """
+
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        self.tasks = list(tasks)
+        self.actor_dim = tasks[0].actor_dim
+        self.observation_space = tasks[0].observation_space
+        self.action_space = tasks[0].action_space
+        bounds = [0, *itertools.accumulate(task.num_robots for task in tasks)]
+        self.num_robots = bounds[-1]
+        self._rows = [slice(*ends) for ends in itertools.pairwise(bounds)]
+
+    def reset(self, index: NDArray[np.integer]) -> None:
+        """Start new episodes for the robots ``index`` (n,)."""
+        for task, rows in zip(self.tasks, self._rows, strict=True):
+            mine = index[(index >= rows.start) & (index < rows.stop)] - rows.start
+            if mine.size:
+                task.reset(mine)
+
+    def step(
+        self, actions: NDArray[np.floating]
+    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+        """One step of all: (M, n) -> reward, terminated, truncated, (M,) each."""
+        steps = [t.step(actions[rows]) for t, rows in zip(self.tasks, self._rows, strict=True)]
+        reward, terminated, truncated = (
+            np.concatenate(parts) for parts in zip(*steps, strict=True)
+        )
+        return reward, terminated, truncated
+
+    def observe(self) -> NDArray[np.float32]:
+        """Observations of all, (M, n)."""
+        return np.concatenate([task.observe() for task in self.tasks])
+
+    def restart(self) -> None:
+        """End every episode and build the worlds anew."""
+        for task in self.tasks:
+            task.restart()
+
+    def forget(self) -> None:
+        """Let what follows depend on ``state_dict`` alone."""
+        for task in self.tasks:
+            task.forget()
+
+    def take_stats(self) -> dict[str, float]:
+        """Sums over the tasks."""
+        stats: dict[str, float] = {}
+        for task in self.tasks:
+            for key, value in task.take_stats().items():
+                stats[key] = stats.get(key, 0.0) + value
+        return stats
+
+    def state_dict(self) -> State:
+        """Of each task its randomness, its episodes, and the rest."""
+        states = [task.state_dict() for task in self.tasks]
+        return {
+            "rng": [state.pop("rng") for state in states],
+            "episodes": [state.pop("episodes") for state in states],
+            "tasks": states,
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on from a ``state_dict``; from one without ``episodes`` with new ones.
+
+        Raises:
+            ValueError: a state of other tasks.
+        """
+        if len(state["tasks"]) != len(self.tasks):
+            raise ValueError(f"a state of {len(state['tasks'])} tasks, not {len(self.tasks)}")
+        for k, task in enumerate(self.tasks):
+            own = {**state["tasks"][k], "rng": state["rng"][k]}
+            if "episodes" in state:
+                own["episodes"] = state["episodes"][k]
+            task.load_state_dict(own)
+
+    def close(self) -> None:
+        """Disconnect from Bullet."""
+        for task in self.tasks:
+            task.close()

@@ -1,0 +1,335 @@
+"""Many robots in a few workers behind Stable-Baselines3's VecEnv; workers that fail are mended."""
+
+from __future__ import annotations
+
+import atexit
+import itertools
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from tdgc.parallel.worker import (
+    Arrays,
+    Beginning,
+    Link,
+    MakeLink,
+    MakeTask,
+    ProcessLink,
+    WorkerError,
+)
+from tdgc.state import State, copies
+
+#: Faults of workers within so many steps that stop a run. A fault of the code comes back at once
+#: or in every episode, and the low level's last 1000 steps; one of the machine does not. Workers
+#: that fail in one step count once: a machine takes all of its own with it.
+FAULTS, FAULT_STEPS = 3, 1000
+# s to start in: ten times what imports and 60 robots' worlds took on a core shared by ten.
+_START_SECONDS = 600.0
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault that was mended by a new worker.
+
+    Attributes:
+        worker: its number.
+        reason: how it failed, with its own traceback if it has one.
+        restarts: how often this worker has been started anew by now.
+        seed: of the new worker's task, see ``worker_seed``.
+    """
+
+    worker: int
+    reason: str
+    restarts: int
+    seed: int
+
+    def __str__(self) -> str:
+        lines = self.reason.splitlines()
+        reason = " ".join(dict.fromkeys((lines[0], lines[-1])))
+        return f"{reason}; started anew with seed {self.seed} (restart {self.restarts})"
+
+
+def worker_seed(seed: int, worker: int, restarts: int = 0) -> int:
+    """Seed of one worker's task, below 2**32; another one after each restart."""
+    return int(np.random.SeedSequence([seed, worker, restarts]).generate_state(1)[0])
+
+
+def lasting(state: State) -> State:
+    """A worker's state without the episodes under way."""
+    under_way = ("episodes", "obs", "returns", "lengths")
+    return {key: value for key, value in state.items() if key not in under_way}
+
+
+class TaskVecEnv(VecEnv):
+    """``num_envs`` robots of a task, spread over ``workers`` workers.
+
+    Robots whose episode ended are reset within ``step``; ``infos`` holds their last observation
+    and whether they were truncated, as SB3 expects.
+
+    With ``recover`` a worker that dies, hangs or raises is started anew with a seed of its own and
+    what its robots had learned when its state was last asked for (see ``state_dicts``); their
+    episodes end, truncated, with no reward for the step. Faults at ``FAULTS`` times within
+    ``FAULT_STEPS`` steps are raised all the same.
+
+    Args:
+        make_task: picklable, called in each worker as ``make_task(robots, seed)``.
+        num_envs: robots altogether.
+        workers: their number; the robots are shared out evenly.
+        seed: from which each worker's seed is drawn.
+        spaces: observation and action space of the task.
+        recover: start workers that fail anew; otherwise the first fault is raised.
+        timeout: s without an answer after which a worker counts as hung. Of all that is asked,
+            building the worlds of 60 robots on terrain takes longest: 3 s of a core.
+        link: starts a worker; a process of this machine unless told.
+
+    Attributes:
+        faults: those mended so far; whoever tells of them takes them out.
+
+    Raises:
+        ValueError: fewer robots than workers, no worker, or no timeout.
+        WorkerError: a worker failed while starting.
+    """
+
+    def __init__(
+        self,
+        make_task: MakeTask,
+        num_envs: int,
+        workers: int,
+        seed: int,
+        spaces: tuple[gym.spaces.Box, gym.spaces.Box],
+        recover: bool = False,
+        timeout: float = 300.0,
+        link: MakeLink = ProcessLink,
+    ) -> None:
+        if not 1 <= workers <= num_envs:
+            raise ValueError(f"workers must be 1 to the {num_envs} robots, not {workers}")
+        if not timeout > 0.0:
+            raise ValueError(f"the workers' timeout must be above 0 s, not {timeout:g}")
+        super().__init__(num_envs, *spaces)
+        self.timeout = timeout
+        self.faults: list[Fault] = []
+        self._make_task, self._seed, self._recover = make_task, seed, recover
+        self._link = link
+        self._arrays = Arrays(num_envs, spaces[0].shape[0], spaces[1].shape[0])
+        self._views = self._arrays.views()
+        bounds = np.linspace(0, num_envs, workers + 1).astype(int).tolist()
+        self._rows = [slice(*ends) for ends in itertools.pairwise(bounds)]
+        self._restarts = [0] * workers
+        self._broken: dict[int, WorkerError] = {}  # workers that failed and were not mended yet
+        self._steps = 0
+        self._fault_steps = deque([-FAULT_STEPS] * FAULTS, maxlen=FAULTS)  # the last faults' steps
+        self._links: list[Link] = []
+        atexit.register(self.close)  # or the interpreter would wait for the workers at its end
+        for k in range(workers):
+            self._links.append(self._start(k))
+        # The last known ones; a worker begins by telling its own.
+        states = [self._receive(k, _START_SECONDS) for k in range(workers)]
+        if self._broken:
+            self.close()
+            raise self._broken[min(self._broken)]
+        self._states: list[State] = [lasting(state) for state in states]
+        self._returns = np.zeros(num_envs)
+        self._lengths = np.zeros(num_envs, dtype=np.int64)
+
+    # ------------------------------------------------------------------ the workers
+
+    def _start(self, worker: int, state: State | None = None) -> Link:
+        seed = worker_seed(self._seed, worker, self._restarts[worker])
+        rows = self._rows[worker]
+        return self._link(worker, Beginning(self._make_task, self._arrays, rows, seed, state))
+
+    def _replace(self, worker: int, restarts: int, state: State | None = None) -> None:
+        """Put a new worker in another one's place; it has to be waited for."""
+        self._links[worker].end(0.0)
+        self._broken.pop(worker, None)
+        self._restarts[worker] = restarts
+        self._links[worker] = self._start(worker, state)
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process numbers of the workers."""
+        return [link.pid for link in self._links]
+
+    def _send(self, word: str) -> None:
+        for link in self._links:
+            link.send(word)
+
+    def _receive(self, worker: int, timeout: float) -> Any:
+        """A worker's answer; or the ``WorkerError``, which stays until the worker is replaced."""
+        if worker not in self._broken:
+            try:
+                return self._links[worker].receive(timeout)
+            except WorkerError as error:
+                self._broken[worker] = error
+        return self._broken[worker]
+
+    def _receive_all(self) -> list[Any]:
+        """Every worker's answer, or its ``WorkerError``.
+
+        Raises:
+            WorkerError: one failed, and no worker is to be started anew.
+        """
+        answers = [self._receive(k, self.timeout) for k in range(len(self._links))]
+        if self._broken and not self._recover:
+            raise self._broken[min(self._broken)]
+        return answers
+
+    def _ask(self, word: str) -> list[Any]:
+        self._send(word)
+        return self._receive_all()
+
+    def _mend(self) -> NDArray[np.bool_]:
+        """Start the broken workers anew; their robots have new observations.
+
+        Returns:
+            (num_envs,) the robots concerned.
+
+        Raises:
+            WorkerError: there were too many faults.
+        """
+        concerned = np.zeros(self.num_envs, dtype=bool)
+        while self._broken:
+            broken = sorted(self._broken.items())
+            self._fault_steps.append(self._steps)
+            if self._steps - self._fault_steps[0] < FAULT_STEPS:
+                raise WorkerError(
+                    f"{FAULTS} faults of workers within {FAULT_STEPS} steps; "
+                    f"the last one: {broken[-1][1]}"
+                )
+            for worker, fault in broken:
+                restarts = self._restarts[worker] + 1
+                self._replace(worker, restarts, self._states[worker])
+                seed = worker_seed(self._seed, worker, restarts)
+                self.faults.append(Fault(worker, str(fault), restarts, seed))
+            for worker, _ in broken:
+                self._receive(worker, _START_SECONDS)
+                concerned[self._rows[worker]] = True
+        return concerned
+
+    # ------------------------------------------------------------------ as SB3 wants it
+
+    def reset(self) -> NDArray[np.float32]:
+        """End all episodes, rebuild the worlds and return the first observations."""
+        self._ask("restart")
+        self._mend()
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        return self.seen()
+
+    def seen(self) -> NDArray[np.float32]:
+        """The last observations, (num_envs, n)."""
+        return self._views["obs"].copy()
+
+    def starts(self) -> NDArray[np.bool_]:
+        """Whether the last observation is the first of its episode, (num_envs,)."""
+        return self._lengths == 0
+
+    def forget(self) -> None:
+        """Let what follows depend on ``state_dicts`` alone, see ``Task``."""
+        self._ask("forget")
+
+    def step_async(self, actions: NDArray[np.floating]) -> None:
+        self._views["actions"][:] = actions
+        self._send("step")
+
+    def step_wait(self) -> Any:
+        self._receive_all()
+        self._steps += 1
+        views = self._views
+        if self._broken:
+            seen = views["obs"].copy()
+            lost = self._mend()
+            views["last_obs"][lost] = seen[lost]
+            views["rewards"][lost] = 0.0
+            views["terminated"][lost], views["truncated"][lost] = False, True
+        self._returns += views["rewards"]
+        self._lengths += 1
+        terminated = views["terminated"].astype(bool)
+        done = terminated | views["truncated"].astype(bool)
+        infos: list[dict[str, Any]] = [{}] * self.num_envs
+        for i in np.flatnonzero(done):
+            infos[i] = {
+                "terminal_observation": views["last_obs"][i].copy(),
+                "TimeLimit.truncated": not terminated[i],
+                "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i])},
+            }
+        self._returns[done] = 0.0
+        self._lengths[done] = 0
+        return views["obs"].copy(), views["rewards"].copy(), done, infos
+
+    def stats(self) -> list[dict[str, float]]:
+        """Each worker's sums since the last call, see ``Task.take_stats``, and ``blow_ups``.
+
+        A broken worker's are lost.
+        """
+        return [sums for sums in self._ask("stats") if not isinstance(sums, WorkerError)]
+
+    def state_dicts(self) -> list[State]:
+        """Each worker's state, with what its robots saw last and its ``restarts``.
+
+        Who loads it goes on as this does after ``forget``, bit for bit. A broken worker's is its
+        last known one, without the episodes under way.
+        """
+        states = []
+        for k, state in enumerate(self._ask("state")):
+            if isinstance(state, WorkerError):
+                state = self._states[k]
+            else:
+                self._states[k] = lasting(state)
+                rows = self._rows[k]
+                state |= copies({"returns": self._returns[rows], "lengths": self._lengths[rows]})
+            states.append({**state, "restarts": self._restarts[k]})
+        return states
+
+    def load_state_dicts(self, states: list[State]) -> None:
+        """Go on from the workers' states; episodes that are missing in one begin anew.
+
+        Raises:
+            ValueError: states of another number of workers or robots.
+            WorkerError: a worker failed.
+        """
+        if len(states) != len(self._links):
+            raise ValueError(f"states of {len(states)} workers do not fit {len(self._links)}")
+        for rows, state in zip(self._rows, states, strict=True):
+            robots = rows.stop - rows.start
+            returns = state.get("returns", np.zeros(robots))
+            if len(returns) != robots:
+                raise ValueError(f"a state of {len(returns)} robots does not fit {robots}")
+            self._returns[rows] = returns
+            self._lengths[rows] = state.get("lengths", 0)
+        for k, state in enumerate(states):
+            restarts = state.get("restarts", 0)
+            if restarts != self._restarts[k]:  # its seed is another one
+                self._replace(k, restarts)
+                self._receive(k, _START_SECONDS)
+            self._links[k].send("load", state)
+        self._receive_all()
+        if self._broken:
+            raise self._broken[min(self._broken)]
+        self._states = [lasting(state) for state in states]
+
+    def close(self) -> None:
+        """Stop the workers, gently and then not."""
+        atexit.unregister(self.close)
+        self._send("close")
+        for k, link in enumerate(self._links):
+            link.end(timeout=0.0 if k in self._broken else 5.0)
+
+    # What SB3 asks of every VecEnv and a batched world has no single environment to answer for.
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        value = None if attr_name == "render_mode" else getattr(self, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError("robots of a batched world have no attributes of their own")
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
+        raise NotImplementedError("robots of a batched world have no methods of their own")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]

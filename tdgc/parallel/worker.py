@@ -1,0 +1,382 @@
+"""A worker: some robots of a task, in a process of its own, and the line to it.
+
+A worker answers one word at a time. Actions, observations, rewards and flags live in shared memory
+that dies with its processes; the pipes carry single words and now and then a state. Robots that
+blow up are reset where they are simulated.
+
+Nothing here imports PyTorch or Stable-Baselines3, and neither does the low level's task: a worker
+would take 150 MB more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import math
+import multiprocessing as mp
+import os
+import pickle
+import signal
+import sys
+import threading
+import traceback
+import types
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import RawArray
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.state import State
+
+#: Observations and rewards are scaled to be of order one; beyond this a robot has blown up. For the
+#: low level it means 50 m/s, 400 rad/s or 10 m above the ground.
+SANE = 100.0
+
+
+class Task(Protocol):
+    """An MDP of M robots, as ``tdgc.tasks.low_env.LowLevelTask`` is one.
+
+    ``state_dict()["rng"]`` is the state of all that is random in it and ``["episodes"]`` that of
+    the episodes under way; a task that loads a state without them begins new ones. ``forget``
+    changes nothing of the state, and makes what follows depend on nothing else.
+    """
+
+    num_robots: int
+    actor_dim: int
+    observation_space: gym.spaces.Box[Any]
+    action_space: gym.spaces.Box[Any]
+
+    def reset(self, index: NDArray[np.integer]) -> None: ...
+
+    def step(
+        self, actions: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]: ...
+
+    def observe(self) -> NDArray[np.float32]: ...
+
+    def restart(self) -> None: ...
+
+    def forget(self) -> None: ...
+
+    def take_stats(self) -> dict[str, float]: ...
+
+    def state_dict(self) -> State: ...
+
+    def load_state_dict(self, state: State) -> None: ...
+
+    def close(self) -> None: ...
+
+
+MakeTask = Callable[[int, int], Task]  # (number of robots, seed) -> task
+
+
+class WorkerError(RuntimeError):
+    """A worker died, hung or raised; the message carries its own traceback if it has one."""
+
+
+class Link(Protocol):
+    """A worker as its learner sees it.
+
+    Attributes:
+        pid: number of its process, where it runs.
+    """
+
+    @property
+    def pid(self) -> int: ...
+
+    def send(self, word: str, argument: Any = None) -> None:
+        """Ask something of it, see ``Worker.answer``. That it is gone shows at ``receive``."""
+
+    def receive(self, timeout: float) -> Any:
+        """Its answer, within ``timeout`` s. The first one, unasked, is its state.
+
+        Raises:
+            WorkerError: it died, hung or raised; nothing more can be asked of it.
+        """
+
+    def end(self, timeout: float) -> None:
+        """End it, by force if it has not ended by itself within ``timeout`` s."""
+
+
+# ---------------------------------------------------------------------------- the worker
+
+
+class Arrays:
+    """The arrays of some robots, in memory that is shared with processes that are given it."""
+
+    def __init__(self, num: int, obs_dim: int, action_dim: int) -> None:
+        self._shape = (num, obs_dim, action_dim)
+        self._raw = {
+            "actions": RawArray("f", num * action_dim),
+            "obs": RawArray("f", num * obs_dim),
+            "last_obs": RawArray("f", num * obs_dim),
+            "rewards": RawArray("f", num),
+            "terminated": RawArray("b", num),
+            "truncated": RawArray("b", num),
+        }
+
+    def views(self) -> dict[str, NDArray[Any]]:
+        """Views by name: actions, obs, last_obs (of episodes that ended), rewards, flags."""
+        num, obs_dim, action_dim = self._shape
+        width = {"actions": action_dim, "obs": obs_dim, "last_obs": obs_dim}
+        views: dict[str, NDArray[Any]] = {}
+        for name, raw in self._raw.items():
+            dtype = np.float32 if name in (*width, "rewards") else np.int8
+            flat: NDArray[Any] = np.frombuffer(raw, dtype=dtype)
+            views[name] = flat.reshape(num, width[name]) if name in width else flat
+        return views
+
+
+class Beginning(NamedTuple):
+    """What a worker begins with.
+
+    Attributes:
+        make_task: picklable, called where the worker runs as ``make_task(robots, seed)``.
+        arrays: of all robots; ``rows`` of them are the worker's.
+        seed: of its task.
+        state: of a worker that failed; all but the randomness is taken over from it.
+    """
+
+    make_task: MakeTask
+    arrays: Arrays
+    rows: slice
+    seed: int
+    state: State | None = None
+
+    def views(self) -> dict[str, NDArray[Any]]:
+        """The worker's rows of the arrays."""
+        return {name: view[self.rows] for name, view in self.arrays.views().items()}
+
+
+MakeLink = Callable[[int, Beginning], Link]  # its number, and how it begins -> a worker
+
+
+def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
+    """One step of a worker's robots; those whose episode ended are reset.
+
+    A robot that blew up gets no reward and is truncated, with its observation before the step as
+    the last one. Returns how many did.
+
+    Raises:
+        FloatingPointError: the task is not finite even after a reset.
+    """
+    reward, terminated, truncated = task.step(views["actions"])
+    obs = task.observe()
+    blown = ~((np.abs(obs) <= SANE).all(axis=1) & (np.abs(reward) <= SANE))
+    # A robot with a NaN leaves Bullet's broad phase in disorder for good: the others of its client
+    # fall through the ground. So the worlds are built anew, which ends every episode in them.
+    poisoned = not (np.isfinite(obs).all() and np.isfinite(reward).all())
+    obs[blown], reward[blown] = views["obs"][blown], 0.0
+    terminated &= ~blown
+    truncated |= blown | (poisoned & ~terminated)
+    done = np.flatnonzero(terminated | truncated)
+    if done.size:
+        views["last_obs"][done] = obs[done]
+        if poisoned:
+            task.take_stats()  # its sums are not finite either
+            task.restart()
+        else:
+            task.reset(done)
+        obs[done] = task.observe()[done]
+        if not np.isfinite(obs).all():
+            raise FloatingPointError("observations are not finite after a reset")
+    views["obs"][:] = obs
+    views["rewards"][:] = reward
+    views["terminated"][:] = terminated
+    views["truncated"][:] = truncated
+    return int(blown.sum())
+
+
+def _load(task: Task, views: dict[str, NDArray[Any]], state: State) -> None:
+    """Go on from a worker's state; what was seen last is part of it, for it may be noisy."""
+    task.load_state_dict(state)
+    views["obs"][:] = state["obs"] if "obs" in state else task.observe()
+
+
+class Worker:
+    """Some robots of a task, whose arrays are ``views``; the rest is as in ``Beginning``."""
+
+    def __init__(
+        self, make_task: MakeTask, views: dict[str, NDArray[Any]], seed: int, state: State | None
+    ) -> None:
+        self.task, self._views = make_task(len(views["rewards"]), seed), views
+        if state is not None:
+            _load(self.task, views, {**state, "rng": self.task.state_dict()["rng"]})
+        self._blow_ups = 0
+
+    def answer(self, word: str, argument: Any = None) -> Any:
+        """Do what the word says: step, restart, forget, load, state or stats."""
+        answer = None
+        if word == "step":
+            self._blow_ups += _step(self.task, self._views)
+        elif word == "restart":
+            self.task.restart()
+            self._views["obs"][:] = self.task.observe()
+        elif word == "forget":
+            self.task.forget()
+        elif word == "load":
+            _load(self.task, self._views, argument)
+        elif word == "state":
+            answer = {**self.task.state_dict(), "obs": self._views["obs"].copy()}
+        elif word == "stats":
+            own = {"memory_mb": memory_mb(os.getpid()), "blow_ups": float(self._blow_ups)}
+            answer = {**self.task.take_stats(), **own}
+            self._blow_ups = 0
+        return answer
+
+
+def memory_mb(pid: int) -> float:
+    """Memory of a process in MB, of pages that it shares its share (proportional set size).
+
+    NaN where the system does not tell, which is anywhere but on Linux.
+    """
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except FileNotFoundError:
+        return math.nan
+    return sum(int(line.split()[1]) / 1024.0 for line in lines if line.startswith("Pss:"))
+
+
+# ---------------------------------------------------------------------------- its process
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has, whatever it is busy with."""
+    parent = mp.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _serve(pipe: Connection, beginning: Beginning) -> None:
+    """A worker's life: tell its state, then answer one word at a time until told to close."""
+    # What a terminal or a batch system sends to all processes is the parent's to answer.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    worker: Worker | None = None
+    try:
+        views = beginning.views()
+        worker = Worker(beginning.make_task, views, beginning.seed, beginning.state)
+        pipe.send(worker.task.state_dict())
+        while True:
+            word, argument = pipe.recv()
+            if word == "close":
+                return
+            pipe.send(worker.answer(word, argument))
+    except (EOFError, BrokenPipeError):
+        pass  # the parent is gone
+    except Exception:
+        with contextlib.suppress(OSError):
+            pipe.send(WorkerError(traceback.format_exc()))
+    finally:
+        if worker is not None:
+            worker.task.close()
+
+
+#: What sets the number of threads of a linear algebra call, whichever library makes it.
+BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Processes started within get one thread a linear algebra call.
+
+    Workers share the cores already, and threads that wait for each other on a busy core make a
+    matrix product of this size forty times slower.
+    """
+    before = {name: os.environ.get(name) for name in BLAS_THREADS}
+    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
+
+
+def keep_memory() -> None:
+    """Let this process keep the memory that it frees, where the C library is glibc.
+
+    A batch's tiles take hundreds of MB. Taking them anew from the system, page by page, was four
+    fifths of the time in which a world is made.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        libc.mallopt(_M_MMAP_MAX, 0)  # all from the heap, none from mappings
+        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)  # and its top is not given back
+
+
+@contextlib.contextmanager
+def _without_script(needed: Any) -> Iterator[None]:
+    """Processes started within do not import the script that runs, with all that it imports,
+    unless ``needed`` comes from there."""
+    script = sys.modules["__main__"]
+    if b"__main__" not in pickle.dumps(needed):
+        sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+
+
+class ProcessLink:
+    """A worker in a process of this machine.
+
+    Args:
+        worker: its number.
+        beginning: what it begins with.
+    """
+
+    def __init__(self, worker: int, beginning: Beginning) -> None:
+        context = mp.get_context("spawn")
+        self._worker = worker
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve,
+            args=(theirs, beginning),
+            daemon=True,
+            name=f"tdgc-worker-{worker}",
+        )
+        with one_blas_thread(), _without_script(beginning.make_task):
+            self._process.start()
+        theirs.close()
+
+    @property
+    def pid(self) -> int:
+        assert self._process.pid is not None
+        return self._process.pid
+
+    def send(self, word: str, argument: Any = None) -> None:
+        with contextlib.suppress(OSError):
+            self._pipe.send((word, argument))
+
+    def receive(self, timeout: float) -> Any:
+        try:
+            if not self._pipe.poll(timeout):
+                raise WorkerError(f"worker {self._worker} gave no answer for {timeout:g} s")
+            answer = self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join(timeout=5.0)  # its pipe closes a moment before it ends
+            code = self._process.exitcode
+            raise WorkerError(f"worker {self._worker} died (exit code {code})") from None
+        if isinstance(answer, WorkerError):
+            raise WorkerError(f"worker {self._worker} failed:\n{answer}")
+        return answer
+
+    def end(self, timeout: float) -> None:
+        self._process.join(timeout)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._pipe.close()

@@ -1,0 +1,38 @@
+"""Policies: their files, the side that acts and the side that learns.
+
+Whoever loads a policy and acts needs no SB3, so what is defined on it is imported when first
+asked for.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from tdgc.policies.acting import Actor, Policy, State, load, one_thread, save_copy
+from tdgc.policies.files import ACTIVATIONS, Header, Mirror, PolicyFileError
+
+if TYPE_CHECKING:
+    from tdgc.policies.learning import AsymmetricActorCriticPolicy, load_into, save
+
+__all__ = [
+    "ACTIVATIONS",
+    "Actor",
+    "AsymmetricActorCriticPolicy",
+    "Header",
+    "Mirror",
+    "Policy",
+    "PolicyFileError",
+    "State",
+    "load",
+    "load_into",
+    "one_thread",
+    "save",
+    "save_copy",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(import_module("tdgc.policies.learning"), name)

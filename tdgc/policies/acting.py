@@ -1,0 +1,205 @@
+"""The side that acts: a policy's file loaded, without SB3."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+import torch.nn.functional as F
+from numpy.typing import ArrayLike, NDArray
+from torch import nn
+
+from tdgc.policies.files import LSTM_TENSORS, Header, read, store
+
+Array = NDArray[np.float32]
+State = tuple[NDArray[np.float32], ...]
+
+_FUNCTIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
+    "elu": F.elu, "relu": th.relu, "tanh": th.tanh
+}  # fmt: skip
+
+
+class Actor(nn.Module):
+    """The mean action, before it is clipped, after the LSTM if any: (n, inputs) -> (n, actions).
+
+    With a mirror it is exactly symmetric, as with ``MirroredHead``.
+    """
+
+    def __init__(self, header: Header, tensors: Mapping[str, th.Tensor]) -> None:
+        super().__init__()
+        self.activation = _FUNCTIONS[header.activation]
+        self.layers = nn.ModuleList()
+        for i in range(len(header.actor) + 1):
+            weight, bias = tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]
+            layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
+            layer.load_state_dict({"weight": weight, "bias": bias}, assign=True)
+            self.layers.append(layer.requires_grad_(False))
+        self.mirror: tuple[th.Tensor, ...] | None = None
+        if header.mirror is not None:
+            self.mirror = tuple(th.tensor(part) for part in dataclasses.astuple(header.mirror))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        if self.mirror is not None:
+            obs_index, obs_sign, action_index, action_sign = self.mirror
+            x = th.cat([x, x[:, obs_index] * obs_sign])
+        for layer in self.layers[:-1]:
+            x = self.activation(layer(x))
+        x = self.layers[-1](x)
+        if self.mirror is not None:
+            seen, mirrored = x.chunk(2)
+            x = 0.5 * (seen + mirrored[:, action_index] * action_sign)
+        return x
+
+    def tensors(self) -> dict[str, th.Tensor]:
+        """Its weights by their names in a policy's file."""
+        return {f"actor.{name[7:]}": tensor for name, tensor in self.state_dict().items()}
+
+
+class Policy:
+    """A loaded policy: acts as SB3's does, without SB3.
+
+    Attributes:
+        header: what its file says.
+        kind: "mlp" or "lstm".
+        meta: what the caller of ``save`` gave.
+        obs_dim: width of the full observation, actor and critic-only part.
+        actor_dim: width of the part that the actor sees.
+        action_dim: number of actions.
+        low, high: bounds of the actions, (action_dim,), in the environment's action units.
+        tensors: all weights by the name in the file, the critic's too.
+        actor: what of them acts, the LSTM apart.
+    """
+
+    def __init__(self, header: Header, tensors: dict[str, th.Tensor]) -> None:
+        self.header = header
+        self.kind = header.kind
+        self.meta = header.meta
+        self.obs_dim = header.obs_dim
+        self.actor_dim = header.actor_dim
+        self.action_dim = len(header.low)
+        self.low: Array = np.array(header.low, dtype=np.float32)
+        self.high: Array = np.array(header.high, dtype=np.float32)
+        self.tensors = tensors
+        self._hidden = header.lstm
+        self.actor = Actor(header, tensors)
+        self._lstm = [tensors[f"actor_lstm.{t}"] for t in LSTM_TENSORS] if header.lstm else []
+        log_std = tensors["log_std"].numpy()
+        if header.mirror is not None:
+            log_std = 0.5 * (log_std + log_std[list(header.mirror.action_index)])
+        self._std: Array = np.exp(log_std)
+        self.seed(0)
+
+    def seed(self, seed: int | None) -> None:
+        """Restart the noise of ``predict(..., deterministic=False)``."""
+        self._rng = np.random.default_rng(seed)
+
+    def predict(
+        self,
+        obs: ArrayLike,
+        state: State | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Array, State | None]:
+        """Actions for observations, in SB3's convention.
+
+        Args:
+            obs: (n, d) or (d,), where d is ``actor_dim`` or ``obs_dim``; of the latter only the
+                actor part is used.
+            state: (h, c), each (1, n, hidden), as returned before; None for zeros. For "mlp" it
+                is handed back as it came.
+            episode_start: (n,) or a scalar, true where the state is to be zeroed first.
+            deterministic: the mean action, or else one drawn from the Gaussian.
+
+        Returns:
+            Actions clipped to ``low`` and ``high``, (n, action_dim) or (action_dim,), and the new
+            state, (h, c) or what was given.
+
+        Raises:
+            ValueError: an observation or state of the wrong shape.
+        """
+        x = np.asarray(obs)
+        if x.ndim not in (1, 2) or x.shape[-1] not in (self.actor_dim, self.obs_dim):
+            raise ValueError(
+                f"observation of shape {x.shape}; its last axis must be {self.actor_dim} wide "
+                f"(actor part) or {self.obs_dim} (all)"
+            )
+        batch: Array = np.array(np.atleast_2d(x)[:, : self.actor_dim], dtype=np.float32)
+        with one_thread(), th.inference_mode():
+            latent = th.from_numpy(batch)
+            if self._hidden is not None:
+                h, c = self._previous(state, episode_start, len(batch), self._hidden)
+                h, c = th.lstm_cell(latent, (h, c), *self._lstm)
+                latent, state = h, (h.numpy()[None], c.numpy()[None])
+            actions: Array = self.actor(latent).numpy()
+        if not deterministic:
+            noise = self._rng.standard_normal(actions.shape, dtype=np.float32)
+            actions = actions + self._std * noise
+        actions = np.clip(actions, self.low, self.high)
+        return (actions if x.ndim == 2 else actions[0]), state
+
+    @staticmethod
+    def _previous(
+        state: State | None, episode_start: ArrayLike | None, n: int, hidden: int
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """(h, c), each (n, hidden), with the rows that start an episode at zero."""
+        if state is None:
+            return th.zeros(n, hidden), th.zeros(n, hidden)
+        shapes = [np.shape(part) for part in state]
+        if shapes != [(1, n, hidden)] * 2:
+            raise ValueError(f"state of shapes {shapes}; it must be two of {(1, n, hidden)}")
+        h, c = (np.array(part[0], dtype=np.float32) for part in state)
+        if episode_start is not None:
+            start = np.broadcast_to(np.asarray(episode_start, dtype=bool), n)
+            h[start] = c[start] = 0.0
+        return th.from_numpy(h), th.from_numpy(c)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """PyTorch on one thread, as a context or a decorator.
+
+    The networks are too small to share out: one thread costs nothing when cores are idle, is
+    several times faster when they are not, and gives the same bits whatever the setting.
+    """
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(threads)
+
+
+def load(path: str | os.PathLike[str]) -> Policy:
+    """The policy that ``save`` wrote as ``path`` (with or without one of the two suffixes).
+
+    Raises:
+        PolicyFileError: whatever is wrong with the files, in one line.
+    """
+    header, tensors = read(path)
+    return Policy(header, tensors)
+
+
+def save_copy(
+    path: str | os.PathLike[str],
+    policy: Policy,
+    changed: Mapping[str, th.Tensor],
+    meta: dict[str, Any],
+) -> None:
+    """Write a loaded policy with some of its weights ``changed``, by name, and another ``meta``.
+
+    Raises:
+        ValueError, OSError: as ``save``; or a tensor that the policy has not or of another shape.
+    """
+    for name, tensor in changed.items():
+        if name not in policy.tensors or tensor.shape != policy.tensors[name].shape:
+            raise ValueError(f"no tensor {name} of shape {tuple(tensor.shape)} in this policy")
+    tensors = {
+        name: changed.get(name, tensor).detach().to("cpu", th.float32).contiguous()
+        for name, tensor in policy.tensors.items()
+    }
+    store(path, dataclasses.replace(policy.header, meta=meta), tensors)

@@ -1,0 +1,394 @@
+"""Policies and their files: weights as safetensors, everything else as JSON, no pickle anywhere.
+
+A policy on disk is two files side by side: ``NAME.safetensors`` holds the tensors of actor and
+critic, ``NAME.json`` says what they mean::
+
+    {"format": "tdgc-policy", "version": 1,
+     "kind": "mlp",                                   "mlp" (Sec. IV-A) or "lstm" (Sec. IV-B)
+     "architecture": {"activation": "elu",            elu, relu or tanh, after each hidden layer
+                      "actor": [256, 128],            hidden sizes
+                      "critic": [256, 128],
+                      "lstm": null},                  hidden size of both LSTMs; null for "mlp"
+     "observation": {"size": 95, "actor_size": 70},   [actor part | critic-only part]
+     "mirror": null,                                  or how left and right change places
+     "action": {"size": 12, "low": [...], "high": [...]},            null: unbounded
+     "sha256": "...",                                 of NAME.safetensors
+     "meta": {...}}                                   the caller's: configuration, seed, steps, ...
+
+Tensors are float32, named ``actor.0.weight``, ``actor.0.bias``, ... (the last one gives the mean
+action), ``critic.*`` likewise (the last one gives the value), ``log_std``, and for "lstm" also
+``actor_lstm.*`` and ``critic_lstm.*`` with ``weight_ih``, ``weight_hh``, ``bias_ih``,
+``bias_hh`` (gate order i, f, g, o as in PyTorch).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import reprlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch as th
+from torch import nn
+
+from tdgc.errors import InputError
+
+FORMAT = "tdgc-policy"
+VERSION = 1
+KINDS = ("mlp", "lstm")
+ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
+LSTM_TENSORS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+
+_deserialize: Callable[[bytes], list[tuple[str, dict[str, Any]]]] = safetensors.deserialize
+
+_MAX_JSON_BYTES = 4 * 2**20
+_MAX_WEIGHT_BYTES = 256 * 2**20
+_MAX_SIZE = 65536  # of any layer, observation or action
+_MAX_LAYERS = 32
+_MAX_FLOAT32 = float(np.finfo(np.float32).max)
+_MAX_TENSOR_HEADER = 65536  # bytes of a safetensors file that are not weights
+
+
+class PolicyFileError(InputError):
+    """A policy file that cannot be used; the message is one line and names the file."""
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """How an observation and an action look in a left-right mirror.
+
+    ``sign * x[..., index]`` is x mirrored. The observation's part may be longer than the actor's,
+    whose entries then come first and stay among themselves.
+    """
+
+    obs_index: tuple[int, ...]
+    obs_sign: tuple[float, ...]
+    action_index: tuple[int, ...]
+    action_sign: tuple[float, ...]
+
+    def actor_part(self, size: int) -> Mirror:
+        """The same for the first ``size`` entries of the observation.
+
+        Raises:
+            ValueError: one of them comes from beyond.
+        """
+        if any(i >= size for i in self.obs_index[:size]):
+            raise ValueError("the mirror mixes the actor's part with the critic's")
+        return Mirror(
+            self.obs_index[:size], self.obs_sign[:size], self.action_index, self.action_sign
+        )
+
+
+@dataclass(frozen=True)
+class Header:
+    """The content of ``NAME.json``, checked."""
+
+    kind: str
+    activation: str
+    actor: tuple[int, ...]
+    critic: tuple[int, ...]
+    lstm: int | None
+    obs_dim: int
+    actor_dim: int
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    meta: dict[str, Any]
+    mirror: Mirror | None = None  # of the actor's part
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Name and shape of every tensor, in the order they are written."""
+        shapes: dict[str, tuple[int, ...]] = {"log_std": (len(self.low),)}
+        for net, inputs, hidden, outputs in (
+            ("actor", self.actor_dim, self.actor, len(self.low)),
+            ("critic", self.obs_dim, self.critic, 1),
+        ):
+            if self.lstm is not None:
+                gates = 4 * self.lstm
+                lstm_shapes = ((gates, inputs), (gates, self.lstm), (gates,), (gates,))
+                for tensor, shape in zip(LSTM_TENSORS, lstm_shapes, strict=True):
+                    shapes[f"{net}_lstm.{tensor}"] = shape
+                inputs = self.lstm
+            for i, size in enumerate((*hidden, outputs)):
+                shapes[f"{net}.{i}.weight"] = (size, inputs)
+                shapes[f"{net}.{i}.bias"] = (size,)
+                inputs = size
+        return shapes
+
+    def nbytes(self) -> int:
+        """Bytes that the weights take, all tensors together."""
+        return 4 * sum(math.prod(shape) for shape in self.shapes().values())
+
+    def to_json(self, sha256: str) -> str:
+        """The text of ``NAME.json``.
+
+        Raises:
+            ValueError: ``meta`` holds something that JSON cannot say.
+        """
+        table = {
+            "format": FORMAT,
+            "version": VERSION,
+            "kind": self.kind,
+            "architecture": {
+                "activation": self.activation,
+                "actor": list(self.actor),
+                "critic": list(self.critic),
+                "lstm": self.lstm,
+            },
+            "observation": {"size": self.obs_dim, "actor_size": self.actor_dim},
+            "action": {
+                "size": len(self.low),
+                "low": [x if math.isfinite(x) else None for x in self.low],
+                "high": [x if math.isfinite(x) else None for x in self.high],
+            },
+            "mirror": None if self.mirror is None else dataclasses.asdict(self.mirror),
+            "sha256": sha256,
+            "meta": self.meta,
+        }
+        try:
+            return json.dumps(table, indent=2, allow_nan=False) + "\n"
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"meta cannot be written as JSON: {error}") from None
+
+    @classmethod
+    def from_json(cls, text: str) -> tuple[Header, str]:
+        """Header and checksum from the text of ``NAME.json``.
+
+        Raises:
+            PolicyFileError: not JSON, another format or version, a key too many or too few, a
+                value of the wrong type or out of range. Its message does not name the file.
+        """
+        try:
+            table = json.loads(text, parse_constant=_no_constant)
+        except (ValueError, RecursionError) as error:
+            raise PolicyFileError(f"not JSON ({_one_line(error)})") from None
+        if not isinstance(table, dict) or table.get("format") != FORMAT:
+            raise PolicyFileError(f"not a {FORMAT} file")
+        version = table.get("version")
+        if not isinstance(version, int) or isinstance(version, bool) or version != VERSION:
+            raise PolicyFileError(f"format version {_shown(version)}; this code reads {VERSION}")
+        keys = ("format", "version", "kind", "architecture", "observation", "action", "mirror",
+                "sha256", "meta")  # fmt: skip
+        _check_keys(table, keys, "the file")
+        kind, sha256, meta = table["kind"], table["sha256"], table["meta"]
+        if kind not in KINDS:
+            raise PolicyFileError(f"kind {_shown(kind)}; known: {', '.join(KINDS)}")
+        if not isinstance(sha256, str):
+            raise PolicyFileError(f"'sha256' must be a string, not {_shown(sha256)}")
+        if not isinstance(meta, dict):
+            raise PolicyFileError(f"'meta' must be a table, not {_shown(meta)}")
+
+        arch = table["architecture"]
+        _check_keys(arch, ("activation", "actor", "critic", "lstm"), "'architecture'")
+        if not isinstance(arch["activation"], str) or arch["activation"] not in ACTIVATIONS:
+            known = ", ".join(ACTIVATIONS)
+            raise PolicyFileError(f"activation {_shown(arch['activation'])}; known: {known}")
+        if (arch["lstm"] is not None) != (kind == "lstm"):
+            raise PolicyFileError(f"'lstm' is {_shown(arch['lstm'])} in a file of kind '{kind}'")
+
+        observation = table["observation"]
+        _check_keys(observation, ("size", "actor_size"), "'observation'")
+        obs_dim = _size(observation["size"], "'size' of 'observation'")
+        actor_dim = _size(observation["actor_size"], "'actor_size'")
+        if actor_dim > obs_dim:
+            raise PolicyFileError(f"'actor_size' {actor_dim} is more than the {obs_dim} there are")
+
+        action = table["action"]
+        _check_keys(action, ("size", "low", "high"), "'action'")
+        action_dim = _size(action["size"], "'size' of 'action'")
+        low = _bounds(action["low"], action_dim, -math.inf, "'low'")
+        high = _bounds(action["high"], action_dim, math.inf, "'high'")
+        if any(lo > hi for lo, hi in zip(low, high, strict=True)):
+            raise PolicyFileError("'low' of 'action' is above 'high'")
+        header = cls(
+            kind=kind,
+            activation=arch["activation"],
+            actor=_sizes(arch["actor"], "'actor'"),
+            critic=_sizes(arch["critic"], "'critic'"),
+            lstm=None if arch["lstm"] is None else _size(arch["lstm"], "'lstm'"),
+            obs_dim=obs_dim,
+            actor_dim=actor_dim,
+            low=low,
+            high=high,
+            meta=meta,
+            mirror=_mirror(table["mirror"], actor_dim, action_dim),
+        )
+        if header.nbytes() > _MAX_WEIGHT_BYTES:
+            raise PolicyFileError(f"{header.nbytes()} bytes of weights, too large to be a policy")
+        return header, sha256
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _check_keys(table: Any, keys: tuple[str, ...], where: str) -> None:
+    if not isinstance(table, dict):
+        raise PolicyFileError(f"{where} must be a table of keys, not {_shown(table)}")
+    for key in table:
+        if key not in keys:
+            raise PolicyFileError(f"unknown key {_shown(key)} in {where}")
+    for key in keys:
+        if key not in table:
+            raise PolicyFileError(f"key '{key}' is missing from {where}")
+
+
+def _size(value: Any, name: str) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MAX_SIZE:
+        raise PolicyFileError(
+            f"{name} must be a whole number in 1..{_MAX_SIZE}, not {_shown(value)}"
+        )
+    return value
+
+
+def _sizes(value: Any, name: str) -> tuple[int, ...]:
+    if not isinstance(value, list) or len(value) > _MAX_LAYERS:
+        raise PolicyFileError(f"{name} must be a list of at most {_MAX_LAYERS} layer sizes")
+    return tuple(_size(v, f"{name}[{i}]") for i, v in enumerate(value))
+
+
+def _mirror(value: Any, obs: int, actions: int) -> Mirror | None:
+    if value is None:
+        return None
+    parts = tuple(f.name for f in dataclasses.fields(Mirror))
+    _check_keys(value, parts, "'mirror'")
+    for part, size in zip(parts, (obs, obs, actions, actions), strict=True):
+        entries = value[part]
+        if not isinstance(entries, list) or len(entries) != size:
+            raise PolicyFileError(f"'{part}' of 'mirror' must be a list of {size} numbers")
+        if part.endswith("index"):
+            if any(type(i) is not int for i in entries) or sorted(entries) != list(range(size)):
+                raise PolicyFileError(f"'{part}' of 'mirror' must hold 0 to {size - 1}, each once")
+        elif any(sign not in (1, -1) for sign in entries):
+            raise PolicyFileError(f"'{part}' of 'mirror' must hold 1 and -1 only")
+    index, sign, action_index, action_sign = (value[part] for part in parts)
+    return Mirror(
+        tuple(index), tuple(map(float, sign)), tuple(action_index), tuple(map(float, action_sign))
+    )
+
+
+def _bounds(value: Any, count: int, unbounded: float, name: str) -> tuple[float, ...]:
+    if not isinstance(value, list) or len(value) != count:
+        raise PolicyFileError(f"{name} of 'action' must be a list of {count} numbers")
+    bounds = []
+    for number in value:
+        if number is None:
+            bounds.append(unbounded)
+        elif isinstance(number, (int, float)) and not isinstance(number, bool):
+            if not abs(number) <= _MAX_FLOAT32:  # a JSON 1e999 reads as inf
+                raise PolicyFileError(f"{name} of 'action' holds {_shown(number)}, out of range")
+            bounds.append(float(number))
+        else:
+            raise PolicyFileError(f"{name} of 'action' holds {_shown(number)}, not a number")
+    return tuple(bounds)
+
+
+def store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Tensor]) -> None:
+    for name, tensor in tensors.items():
+        if not bool(tensor.isfinite().all()):
+            raise ValueError(f"tensor {name} holds a number that is not finite; not saved")
+    weights = safetensors.torch.save(tensors)
+    text = header.to_json(hashlib.sha256(weights).hexdigest()).encode()
+    if len(text) > _MAX_JSON_BYTES:
+        raise ValueError(f"meta takes {len(text)} bytes, more than {_MAX_JSON_BYTES}")
+    Header.from_json(text.decode())  # what could not be read back is not written
+    stem = _stem(path)
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    _write(_with_suffix(stem, ".safetensors"), weights)
+    _write(_with_suffix(stem, ".json"), text)
+
+
+def _stem(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    return path.with_suffix("") if path.suffix in (".safetensors", ".json") else path
+
+
+def _with_suffix(stem: Path, suffix: str) -> Path:
+    # Not Path.with_suffix, which would eat the ".5" of "low-v1.5".
+    return stem.parent / (stem.name + suffix)
+
+
+def _write(path: Path, data: bytes) -> None:
+    temporary = path.parent / f".{path.name}.{os.getpid()}.tmp"
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _read_bytes(path: Path, limit: int) -> bytes:
+    try:
+        with open(path, "rb") as file:
+            data = file.read(limit + 1)
+    except FileNotFoundError:
+        raise PolicyFileError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise PolicyFileError(f"{path}: cannot be read ({_one_line(error)})") from None
+    if len(data) > limit:
+        raise PolicyFileError(f"{path}: larger than the {limit} bytes it can have")
+    return data
+
+
+def read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
+    stem = _stem(path)
+    header_path, weights_path = _with_suffix(stem, ".json"), _with_suffix(stem, ".safetensors")
+    try:
+        text = _read_bytes(header_path, _MAX_JSON_BYTES).decode()
+    except UnicodeDecodeError:
+        raise PolicyFileError(f"{header_path}: not UTF-8 text") from None
+    try:
+        header, sha256 = Header.from_json(text)
+    except PolicyFileError as error:
+        raise PolicyFileError(f"{header_path}: {error}") from None
+
+    # The header's sizes are checked by now, and they bound what is read and allocated here.
+    shapes, need = header.shapes(), header.nbytes()
+    data = _read_bytes(weights_path, need + _MAX_TENSOR_HEADER)
+    if len(data) < need:
+        raise PolicyFileError(
+            f"{weights_path}: {len(data)} bytes, truncated: the architecture needs over {need}"
+        )
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise PolicyFileError(f"{weights_path}: not the file that {header_path.name} was made for")
+    try:
+        entries = dict(_deserialize(data))
+    except safetensors.SafetensorError as error:
+        message = f"{weights_path}: not a safetensors file ({_one_line(error)})"
+        raise PolicyFileError(message) from None
+
+    for name in sorted(entries.keys() ^ shapes.keys()):
+        what = "is missing" if name in shapes else "is not part of the architecture"
+        raise PolicyFileError(f"{weights_path}: tensor {name!r:.60} {what}")
+    tensors = {}
+    for name, shape in shapes.items():
+        entry = entries[name]
+        if entry["dtype"] != "F32" or tuple(entry["shape"]) != shape:
+            raise PolicyFileError(
+                f"{weights_path}: tensor '{name}' is {entry['dtype']} {tuple(entry['shape'])}, "
+                f"the architecture needs F32 {shape}"
+            )
+        array = np.frombuffer(entry["data"], "<f4").astype(np.float32).reshape(shape)
+        if not np.isfinite(array).all():
+            raise PolicyFileError(f"{weights_path}: tensor '{name}' holds a number not finite")
+        tensors[name] = th.from_numpy(array)
+    return header, tensors
+
+
+def _shown(value: Any) -> str:
+    return reprlib.repr(value)[:40]  # repr fails on what is nested about as deep as can be read
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

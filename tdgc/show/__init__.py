@@ -1,0 +1,1 @@
+"""What is looked at: figures, films, the report, Bullet's window."""

@@ -1,0 +1,446 @@
+"""Films and film strips of recorded episodes, drawn without a display.
+
+A frame is the robot on its tile, seen from behind and to the right, with its commands beside it
+and a gait diagram of the last seconds under it. MP4 needs PyAV, the extra ``video``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.util
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import font_manager
+from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
+
+from tdgc.benchmark.evaluation import spread, tile_of
+from tdgc.benchmark.recording import Recording, spans, stretches
+from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.errors import install_hint
+from tdgc.show.plots import GAIT_COLOURS, POLICY_COLOURS, sheet
+from tdgc.sim.commands import CONTINUOUS, UNITS, gait_index
+from tdgc.sim.gaits import FEET, GAITS
+from tdgc.sim.robot import Array
+from tdgc.sim.terrain import TILE_SIZE, Tile, TileField, file_label
+from tdgc.sim.world import Stage
+from tdgc.tasks.low_env import GOAL_RADIUS
+
+FRAME_SECONDS = 0.04  # 25 frames a second: every second control step
+ENDING_SECONDS = 1.0  # the last frame stays, so that the outcome can be read
+GIF_EVERY, GIF_SCALE = 2, 2  # a GIF has every second frame at half the size: a tenth of the bytes
+
+# All in pixels. Even sizes, since the encoder halves the colours' resolution.
+_SCENE, _PANEL, _DIAGRAM = (660, 420), 300, 120
+SIZE = (_SCENE[0] + _PANEL, _SCENE[1] + _DIAGRAM)  # (width, height) of a frame
+_SHOT = (400, 260)  # a picture of a strip
+_MOMENTS = 5  # pictures of an episode in a strip
+_DIAGRAM_SECONDS = 3.0  # 6 to 12 cycles of the gait
+
+# The camera, relative to the direction of travel: it stands higher than any pillar.
+_AZIMUTH, _ELEVATION, _DISTANCE = -2.45, 0.5, 1.8  # rad, rad, m
+_STRIP_DISTANCE = 2.4  # m: more of the tile where nothing moves
+_SMOOTHING = 1.0  # s, over which the camera's way is averaged
+
+_TEXTURE = 1024  # pixels along a tile: 8 mm each
+_GRID = 0.5  # m between the lines on the ground
+_GROUND, _GOAL = (222, 213, 196), (0, 140, 90)
+_INK, _GREY, _PALE = (30, 34, 40), (125, 130, 138), (226, 228, 232)
+_WANTED, _MARK = (176, 205, 235), (213, 94, 0)  # desired contact; what was measured
+
+_MEASURED = ("vx", "vy", "yaw_rate", "body_height")  # commands that a recording has measured
+
+
+class FilmError(RuntimeError):
+    """A film that cannot be written; the message is one line."""
+
+
+def check_installed() -> None:
+    """Refuse MP4 without PyAV.
+
+    Raises:
+        FilmError: it is not installed; the message says what to install.
+    """
+    if importlib.util.find_spec("av") is None:
+        raise FilmError(f"MP4 needs PyAV: {install_hint('video')}")
+
+
+# ---------------------------------------------------------------------------- the stage
+
+
+def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which matplotlib brings along."""
+    weight = "bold" if bold else "normal"
+    name = font_manager.FontProperties(family="DejaVu Sans", weight=weight)
+    return ImageFont.truetype(font_manager.findfont(name), size)
+
+
+def ground_picture(tile: Tile, way: Array | None = None, colour: str = "black") -> Image.Image:
+    """What is painted on the ground: height as brightness, a grid, the goal, and ``way`` (n, 2) m.
+
+    As ``Stage.paint`` wants it: rows along y, columns against x.
+    """
+    index = np.rint((np.arange(_TEXTURE) + 0.5) / _TEXTURE * (len(tile.heights) - 1)).astype(int)
+    heights = tile.heights[np.ix_(index, index)].astype(np.float64)
+    low, high = float(heights.min()), float(heights.max())
+    # At least 0.3 m for the whole scale, or low relief would look as deep as a trench.
+    light = 1.0 - 0.35 * (high - heights) / max(high - low, 0.3)
+    pixels = (light[..., None] * np.array(_GROUND)).astype(np.uint8)
+    image = Image.fromarray(np.ascontiguousarray(pixels[::-1].transpose(1, 0, 2)))
+    draw, scale = ImageDraw.Draw(image), _TEXTURE / TILE_SIZE
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return _TEXTURE - 1 - scale * x, scale * y
+
+    for k in range(1, round(TILE_SIZE / _GRID)):
+        at = k * _GRID
+        draw.line([place(at, 0.0), place(at, TILE_SIZE)], (172, 165, 152), 2)
+        draw.line([place(0.0, at), place(TILE_SIZE, at)], (172, 165, 152), 2)
+    x, y = tile.goal
+    corners = place(x + GOAL_RADIUS, y - GOAL_RADIUS), place(x - GOAL_RADIUS, y + GOAL_RADIUS)
+    draw.ellipse([*corners[0], *corners[1]], (182, 222, 196), _GOAL, 6)
+    if way is not None:
+        draw.line([place(*point) for point in way.tolist()], colour, 5, joint="curve")
+    return image
+
+
+def field_of(tile: Tile) -> TileField:
+    """A field that holds one tile for good."""
+    field = TileField((1, 1))
+    field.place(0, 0, tile)
+    field.heights.setflags(write=False)  # for a faster world
+    return field
+
+
+def set_stage(
+    tile: Tile,
+    robot: RobotConfig,
+    window: bool = False,
+    way: Array | None = None,
+    colour: str = "black",
+) -> Stage:
+    """A robot on ``tile``, with the ground painted (see ``ground_picture``) and a pole at the goal.
+
+    Raises:
+        WindowError: ``window`` where there is no display.
+    """
+    stage = Stage(robot, PhysicsConfig(), field_of(tile), window)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "ground.png")
+        ground_picture(tile, way, colour).save(path)
+        stage.paint(path)
+    foot = np.append(tile.goal, stage.ground_height(tile.goal[:1], tile.goal[1:])[0])
+    stage.mark(foot, (_GOAL[0] / 255, _GOAL[1] / 255, _GOAL[2] / 255))
+    return stage
+
+
+@contextlib.contextmanager
+def staged(recording: Recording, trail: bool = False) -> Iterator[Stage]:
+    """The stage of ``recording``; ``trail`` paints the base's way on the ground."""
+    tile = tile_of(recording.seed, recording.family, recording.level, recording.episode)
+    way = recording.position[:, :2] if trail else None
+    stage = set_stage(tile, recording.robot, way=way, colour=POLICY_COLOURS[recording.policy])
+    try:
+        yield stage
+    finally:
+        stage.close()
+
+
+def camera_way(recording: Recording) -> Array:
+    """What the camera looks at, (n, 3) m: the base's way, averaged over a second around."""
+    half = max(1, round(0.5 * _SMOOTHING / recording.dt))
+    padded = np.pad(recording.position, ((half, half), (0, 0)), mode="edge")
+    sums = np.cumsum(np.pad(padded, ((1, 0), (0, 0))), axis=0)
+    return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1))
+
+
+def _shoot(
+    stage: Stage, recording: Recording, way: Array, i: int, size: tuple[int, int], distance: float
+) -> Image.Image:
+    stage.show(recording.position[i], recording.quaternion[i], recording.q[i])
+    return Image.fromarray(stage.picture(0, *size, _AZIMUTH, _ELEVATION, distance, target=way[i]))
+
+
+# ---------------------------------------------------------------------------- a frame
+
+
+class Overlay:
+    """Draws what stands beside and under the picture: commands, gait, contacts."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._gait = gait_index(recording.command)
+        self._small, self._text, self._head = _font(11), _font(13), _font(20, bold=True)
+        height = recording.height - recording.robot.base_height  # as the command counts it
+        self._measured = dict(zip(_MEASURED, [*recording.velocity.T, height], strict=True))
+
+    def frame(self, picture: Image.Image, i: int, ended: bool = False) -> Image.Image:
+        """Control step ``i`` with its picture, of ``SIZE``; ``ended`` says how it ended."""
+        image = Image.new("RGB", SIZE, "white")
+        image.paste(picture, (0, 0))
+        draw = ImageDraw.Draw(image)
+        self._commands(draw, i)
+        self._contacts(draw, i)
+        if ended:
+            text = self._recording.ending
+            width = draw.textlength(text, self._head)
+            draw.rectangle([16, 14, 16 + width + 20, 46], "white", _INK)
+            draw.text((26, 30), text, _INK, self._head, "lm")
+        return image
+
+    def _commands(self, draw: ImageDraw.ImageDraw, i: int) -> None:
+        """The panel at the right: each command on its range, with what was measured."""
+        r, x0, x1 = self._recording, _SCENE[0] + 14, SIZE[0] - 14
+        draw.text((x0, 12), r.policy, POLICY_COLOURS[r.policy], self._head)
+        draw.text((x1, 16), f"{(i + 1) * r.dt:.2f} s", _INK, self._text, "ra")
+        where = f"{r.family}, level {r.level}, {r.condition}, episode {r.episode}"
+        draw.text((x0, 40), where, _INK, self._small)
+        gait = int(self._gait[i])
+        draw.rounded_rectangle([x0, 60, x0 + 74, 80], 6, GAIT_COLOURS[gait])
+        draw.text((x0 + 37, 70), GAITS[gait], "black", self._text, "mm")
+        draw.rectangle([x0 + 92, 64, x0 + 96, 76], _INK)
+        draw.text((x0 + 102, 70), "commanded", _INK, self._small, "lm")
+        draw.ellipse([x0 + 186, 65, x0 + 196, 75], "white", _MARK, 2)
+        draw.text((x0 + 202, 70), "measured", _INK, self._small, "lm")
+        for j, name in enumerate(CONTINUOUS):
+            top = 92 + 27 * j
+            low, high = r.bounds[j]
+            value, unit = r.command[i, j], "" if UNITS[j] == "1" else UNITS[j]
+            digits = 2 if high - low > 0.01 else 4
+            draw.text((x0, top), name, _INK, self._small)
+            shown = round(float(value), digits) + 0.0  # no -0.00
+            draw.text((x1, top), f"{shown:.{digits}f} {unit}".strip(), _INK, self._small, "ra")
+            line = top + 19
+            draw.line([x0, line, x1, line], _PALE, 4)
+
+            def at(v: float, low: float = low, high: float = high) -> float:
+                share = (v - low) / (high - low) if high > low else 0.5
+                return x0 + (x1 - x0) * min(1.0, max(0.0, share))
+
+            if low < 0.0 < high:
+                draw.line([at(0.0), line - 3, at(0.0), line + 3], _GREY, 1)
+            if name in self._measured:
+                x = at(float(self._measured[name][i]))
+                draw.ellipse([x - 5, line - 5, x + 5, line + 5], "white", _MARK, 2)
+            draw.rectangle([at(value) - 2, line - 6, at(value) + 2, line + 6], _INK)
+
+    def _contacts(self, draw: ImageDraw.ImageDraw, i: int) -> None:
+        """The gait diagram: the last seconds, now at the right edge."""
+        r, left, right, top = self._recording, 44, SIZE[0] - 14, _SCENE[1] + 8
+        n = round(_DIAGRAM_SECONDS / r.dt)
+        first = i + 1 - n  # of the window; below 0 there was nothing
+        scale = (right - left) / n
+        seen = slice(max(0, first), i + 1)
+        begin = left + scale * (seen.start - first)
+        for a, b, gait in stretches(self._gait[seen]):
+            draw.rectangle([begin + scale * a, top, begin + scale * b, top + 6], GAIT_COLOURS[gait])
+        for foot, name in enumerate(FEET):
+            y = top + 12 + 20 * foot
+            draw.text((14, y + 8), name, _INK, self._text, "lm")
+            draw.rectangle([left, y, right, y + 16], (246, 247, 249))
+            for a, b in spans(r.desired[seen, foot]):
+                draw.rectangle([begin + scale * a, y, begin + scale * b - 1, y + 16], _WANTED)
+            for a, b in spans(r.contact[seen, foot]):
+                draw.rectangle([begin + scale * a, y + 5, begin + scale * b - 1, y + 11], _INK)
+        y = top + 12 + 20 * len(FEET) + 8
+        draw.rectangle([left, y - 5, left + 22, y + 5], _WANTED)
+        draw.text((left + 28, y), "contact as the gait desires", _INK, self._small, "lm")
+        draw.rectangle([left + 210, y - 3, left + 232, y + 3], _INK)
+        draw.text((left + 238, y), "foot in contact", _INK, self._small, "lm")
+        draw.text((right, y), f"last {_DIAGRAM_SECONDS:g} s", _INK, self._small, "rm")
+
+
+def frames(recording: Recording) -> Iterator[Image.Image]:
+    """The film's frames, ``FRAME_SECONDS`` apart; the last one stays for ``ENDING_SECONDS``."""
+    n, every = len(recording.command), _frame_steps(recording)
+    way, overlay = camera_way(recording), Overlay(recording)
+    with staged(recording) as stage:
+        for i in [*range(0, n - 1, every), n - 1]:
+            picture = _shoot(stage, recording, way, i, _SCENE, _DISTANCE)
+            yield overlay.frame(picture, i)
+    last = overlay.frame(picture, n - 1, ended=True)
+    for _ in range(round(ENDING_SECONDS / FRAME_SECONDS)):
+        yield last
+
+
+def _frame_steps(recording: Recording) -> int:
+    """Control steps between two frames."""
+    return max(1, round(FRAME_SECONDS / recording.dt))
+
+
+# ---------------------------------------------------------------------------- files
+
+
+class _Mp4:
+    """An MP4 file that is there once it is whole."""
+
+    def __init__(self, path: Path, rate: Fraction) -> None:
+        check_installed()
+        import av
+
+        self._path, self._partial = path, path.with_suffix(f".{os.getpid()}.tmp")
+        self._file = av.open(str(self._partial), "w", format="mp4")
+        self._stream: Any = self._file.add_stream("libx264", rate=rate, options={"crf": "23"})
+        self._stream.width, self._stream.height = SIZE
+        self._stream.pix_fmt = "yuv420p"  # what browsers and players can show
+
+    def __enter__(self) -> _Mp4:
+        return self
+
+    def add(self, image: Image.Image) -> None:
+        from av import VideoFrame
+
+        self._file.mux(
+            self._stream.encode(VideoFrame.from_ndarray(np.asarray(image), format="rgb24"))
+        )
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if kind is None:
+                self._file.mux(self._stream.encode())
+            self._file.close()
+            if kind is None:
+                os.replace(self._partial, self._path)
+        finally:
+            self._partial.unlink(missing_ok=True)
+
+
+def film(recording: Recording, folder: Path, mp4: bool = True) -> None:
+    """Write ``film_<name>.gif`` and, with ``mp4``, ``film_<name>.mp4``, each whole or not at all.
+
+    Raises:
+        FilmError: ``mp4`` without PyAV.
+        OSError: a file cannot be written.
+    """
+    stem = folder / f"film_{recording.name}"
+    rate = 1 / Fraction(recording.dt * _frame_steps(recording)).limit_denominator(1000)
+    small: list[Image.Image] = []
+    with _Mp4(stem.with_suffix(".mp4"), rate) if mp4 else contextlib.nullcontext() as file:
+        for k, frame in enumerate(frames(recording)):
+            if file is not None:
+                file.add(frame)
+            if k % GIF_EVERY == 0:
+                size = (SIZE[0] // GIF_SCALE, SIZE[1] // GIF_SCALE)
+                reduced = frame.resize(size, Image.Resampling.LANCZOS)
+                # Of Pillow's methods the one that keeps the robot's orange, in half the bytes.
+                method = Image.Quantize.FASTOCTREE
+                small.append(reduced.quantize(method=method, dither=Image.Dither.NONE))
+    partial = stem.with_suffix(f".{os.getpid()}.tmp")
+    try:
+        small[0].save(
+            partial,
+            format="GIF",
+            save_all=True,
+            append_images=small[1:],
+            duration=round(1000 * GIF_EVERY / rate),
+            loop=0,
+        )
+        os.replace(partial, stem.with_suffix(".gif"))
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def moments(recording: Recording) -> list[int]:
+    """Control steps of a strip's pictures: evenly from the first to the last."""
+    return np.rint(np.linspace(0, len(recording.command) - 1, _MOMENTS)).astype(int).tolist()
+
+
+def strip(recordings: Sequence[Recording], folder: Path) -> Path:
+    """Write a film strip of the same tile under several policies, a row each; its path.
+
+    Its name is ``strip_<family>_<level>.png``, with the condition at the end where that is not
+    nominal.
+
+    Raises:
+        ValueError: recordings of different tiles.
+        OSError: the file cannot be written.
+    """
+    first = recordings[0]
+    tiles = {(r.condition, r.family, r.level, r.episode, r.seed) for r in recordings}
+    if len(tiles) > 1:
+        raise ValueError(f"a strip is of one tile, not of {len(tiles)}")
+    left, head, gap = 112, 40, 6
+    width = left + _MOMENTS * (_SHOT[0] + gap)
+    image = Image.new("RGB", (width, head + len(recordings) * (_SHOT[1] + gap)), "white")
+    draw = ImageDraw.Draw(image)
+    title = f"{first.family}, level {first.level}, {first.condition}, episode {first.episode}"
+    draw.text((left, head // 2), title, _INK, _font(20, bold=True), "lm")
+    draw.text((width - gap, head // 2), "line: way of the base", _INK, _font(15), "rm")
+    for row, r in enumerate(recordings):
+        y = head + row * (_SHOT[1] + gap)
+        draw.text((8, y + 108), r.policy, POLICY_COLOURS[r.policy], _font(20, bold=True), "lm")
+        for k, line in enumerate(r.ending.split(", ")):
+            draw.text((8, y + 134 + 20 * k), line, _INK, _font(15), "lm")
+        way, gaits = camera_way(r), gait_index(r.command)
+        with staged(r, trail=True) as stage:
+            for column, i in enumerate(moments(r)):
+                x = left + column * (_SHOT[0] + gap)
+                # Drawn at twice the size and reduced: Bullet's renderer leaves edges jagged.
+                large = _shoot(stage, r, way, i, (2 * _SHOT[0], 2 * _SHOT[1]), _STRIP_DISTANCE)
+                image.paste(large.resize(_SHOT, Image.Resampling.LANCZOS), (x, y))
+                gait = GAITS[gaits[i]]
+                draw.rounded_rectangle([x + 8, y + 8, x + 72, y + 30], 6, GAIT_COLOURS[gaits[i]])
+                draw.text((x + 40, y + 19), gait, "black", _font(14), "mm")
+                draw.rounded_rectangle(
+                    [x + _SHOT[0] - 64, y + 8, x + _SHOT[0] - 8, y + 30], 6, "white"
+                )
+                time = f"{(i + 1) * r.dt:.1f} s"
+                draw.text((x + _SHOT[0] - 36, y + 19), time, _INK, _font(14), "mm")
+    suffix = "" if first.condition == "nominal" else f"_{first.condition}"
+    path = folder / f"strip_{file_label(first.family)}_{first.level}{suffix}.png"
+    partial = path.with_suffix(f".{os.getpid()}.tmp")
+    try:
+        image.save(partial, format="PNG")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+# ---------------------------------------------------------------------------- all of an evaluation
+
+_Job = tuple[str, list[Recording]]
+
+
+def _produce(job: _Job, folder: Path, mp4: bool) -> str | None:
+    """A film with its sheet, or a strip; what went wrong, in a line."""
+    kind, recordings = job
+    try:
+        if kind == "strip":
+            strip(recordings, folder)
+        else:
+            sheet(recordings[0], folder / f"sheet_{recordings[0].name}.png")
+            film(recordings[0], folder, mp4)
+    except OSError as error:
+        return f"no {kind} of {recordings[0].name}: {error}"
+    return None
+
+
+def produce(recordings: Sequence[Recording], folder: Path, workers: int) -> list[str]:
+    """Write into ``folder`` a film and a sheet of each recording, and a strip of each cell's first
+    episode under all policies. Returns what could not be written, a line each.
+    """
+    problems = []
+    try:
+        check_installed()
+    except FilmError as error:
+        problems.append(str(error))
+    jobs: list[_Job] = [("film", [r]) for r in recordings]
+    cells: dict[tuple[str, str, int], list[Recording]] = {}
+    for r in recordings:
+        if r.episode == 0:
+            cells.setdefault((r.condition, r.family, r.level), []).append(r)
+    jobs += [("strip", rows) for rows in cells.values()]
+    work = functools.partial(_produce, folder=folder, mp4=not problems)
+    with tqdm(total=len(jobs), unit="film", dynamic_ncols=True) as bar:
+        for problem in spread(work, jobs, workers):
+            problems += [problem] if problem else []
+            bar.update()
+    return problems

@@ -1,0 +1,168 @@
+"""Bullet's own window: drive the low level by hand, or watch a policy decide on a tile.
+
+The window only shows the robot; it is simulated apart, as everywhere else. So nothing that is done
+to the window changes what the robot does, except through the sliders.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.benchmark.drivers import Driver
+from tdgc.benchmark.evaluation import OUTCOMES, Cell, low_config, run_cell, tile_of
+from tdgc.policies import Policy
+from tdgc.show.film import field_of, set_stage
+from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, CommandDecoder, default_command, gait_index
+from tdgc.sim.gaits import GAITS, gait_embedding
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.sim.terrain import TileField
+from tdgc.sim.world import Stage, WindowError
+from tdgc.tasks.low_env import is_fallen
+
+MODES = ("drive", "watch")
+_TEXT_SECONDS = 0.1  # between two texts, a decision's length: more often cannot be read
+
+
+def slider_command(values: Array) -> Array:
+    """Where the sliders stand, (13,), as commands (15,): the 12 continuous ones and the gait.
+
+    Raises:
+        ValueError: a gait that rounds to none of ``GAITS``.
+    """
+    return np.concatenate([values[:12], gait_embedding(round(float(values[12])))])
+
+
+def describe(command: Array) -> str:
+    """Gait and velocities of a command (15,), for the text above the robot."""
+    parts = [GAITS[int(gait_index(command))]]
+    parts += [f"{n} {command[INDEX[n]]:.2f} {UNITS[INDEX[n]]}" for n in ("vx", "vy", "yaw_rate")]
+    return ", ".join(parts)
+
+
+class _Window:
+    """The stage in step with a world of one robot, at the pace of real time."""
+
+    def __init__(self, loco: Locomotion, field: TileField, stage: Stage) -> None:
+        self._loco, self._stage, self._dt = loco, stage, loco.physics.control_dt
+        self._origin = np.append(field.origin(0, 0), 0.0)
+        self._every = max(1, round(_TEXT_SECONDS / self._dt))
+        self._due = time.perf_counter()
+
+    def update(self, step: int, text: str) -> None:
+        """Show the robot after control step number ``step``, and wait until that is due.
+
+        Raises:
+            WindowError: the window was closed.
+        """
+        state = self._loco.world.state
+        self._stage.show(state.position[0] - self._origin, state.quaternion[0], state.q[0])
+        if step % self._every == 0:
+            self._stage.follow(text)
+        self._due = max(self._due + self._dt, time.perf_counter())  # what is late stays late
+        time.sleep(max(0.0, self._due - time.perf_counter()))
+
+
+def drive(low: Policy, cell: Cell, seed: int) -> None:
+    """Sliders for the 12 continuous commands and the gait, until the window is closed.
+
+    A robot that falls, or leaves its tile, stands at the start again; so does one whose button is
+    pressed.
+
+    Args:
+        low: the low level.
+        cell: says which tile; its policy does not matter.
+        seed: of the evaluation's tiles.
+
+    Raises:
+        WindowError: the window cannot be opened.
+    """
+    config, tile = low_config(low), tile_of(seed, cell.family, cell.level, cell.first)
+    stage, field = set_stage(tile, config.robot, window=True), field_of(tile)
+    loco = Locomotion(1, config.robot, config.physics, field, config.gyro)
+    decoder, start = CommandDecoder(config.commands), default_command()
+    for j, name in enumerate(CONTINUOUS):
+        label = name if UNITS[j] == "1" else f"{name} ({UNITS[j]})"
+        stage.add_slider(label, decoder.low[j], decoder.high[j], start[j])
+    stage.add_slider(f"gait ({', '.join(GAITS)})", 0, len(GAITS) - 1, 0)
+    stage.add_slider("back to the start", 1, 0, 0)
+    window = _Window(loco, field, stage)
+    row, place = np.zeros(1, dtype=int), field.starts[0, 0]
+
+    def begin() -> None:
+        loco.place(row, place[None, :2] + field.origin(row, 0), place[2:], np.zeros(1))
+
+    begin()
+    step, pressed = 0, 0.0
+    try:
+        while True:
+            values = stage.read_sliders()
+            loco.command[0] = slider_command(values[:-1])
+            actions, _ = low.predict(loco.observe())
+            loco.act(actions)
+            x, y = loco.world.state.position[:, :2].T
+            if (
+                values[-1] != pressed
+                or is_fallen(loco.world)[0]
+                or not field.on_tile(0, 0, x, y)[0]
+            ):
+                pressed = float(values[-1])
+                begin()
+            window.update(step, describe(loco.command[0]))
+            step += 1
+    except WindowError:
+        pass  # closed: that is how it ends
+    finally:
+        loco.world.close()
+        stage.close()
+
+
+class Monitor:
+    """A ``Watcher`` that shows a batch of one robot in the window as it runs.
+
+    Attributes:
+        text: what stands above the robot: what is commanded, and at the end the outcome.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self.text = ""
+
+    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
+        self._loco = loco
+        self._window = _Window(loco, field, self._stage)
+
+    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+        self.text = describe(self._loco.command[0])
+        if outcome[0] >= 0:
+            self.text = OUTCOMES[outcome[0]].replace("_", " ")
+        self._window.update(step, self.text)
+
+
+def watch(low: Policy, driver: Driver, cell: Cell, seed: int) -> None:
+    """Show one episode at the pace of real time, then its end until the window is closed.
+
+    Args:
+        low: the low level.
+        driver: what commands it.
+        cell: the episode; its count is 1.
+        seed: of the evaluation's tiles.
+
+    Raises:
+        WindowError: the window cannot be opened.
+    """
+    tile = tile_of(seed, cell.family, cell.level, cell.first)
+    stage = set_stage(tile, low_config(low).robot, window=True)
+    try:
+        monitor = Monitor(stage)
+        run_cell(cell, low, driver, seed, monitor)
+        while True:
+            stage.follow(monitor.text)
+            time.sleep(_TEXT_SECONDS)
+    except WindowError:
+        pass  # closed: that is how it ends
+    finally:
+        stage.close()

@@ -1,0 +1,332 @@
+"""One page about an evaluation: files of a results folder in, ``report.html`` out.
+
+The page needs nothing but itself: pictures and films are inside as data URIs, and its own policy
+(``Content-Security-Policy``) forbids everything else. The template is ``report.html`` beside this
+module; Jinja escapes all that goes into it.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import glob
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+import tdgc
+from tdgc.benchmark.diagnosis import LAYERS
+from tdgc.benchmark.evaluation import (
+    CONDITIONS,
+    HORIZON,
+    OUTCOMES,
+    PUSH_INTERVAL,
+    Condition,
+    EpisodeRecord,
+)
+from tdgc.sim.terrain import file_label
+from tdgc.tasks.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE
+
+NAME = "report.html"
+#: Bytes of films in a page, a choice: ten of 2 MB each, the size of an MP4 of a whole episode. What
+#: does not fit is named instead.
+FILM_BYTES = 24_000_000
+
+Row = dict[str, str]
+_TILE = ("condition", "family", "level", "episode")  # columns that say which tile it was
+
+#: Figures of ``tdgc.show.plots``: file, caption, and what is to be seen for those who cannot.
+FIGURES = (
+    (
+        "success.png",
+        "Success by family and level, with Wilson 95 % intervals",
+        "A panel a terrain family: success rate over the level, a line a policy. The tables above "
+        "have the same numbers.",
+    ),
+    ("gaits.png", "Time in each gait by family", "Bars of each policy's share of time in a gait."),
+    (
+        "headings.png",
+        "Where the nose points against the direction of travel",
+        "Polar histograms by family and policy of the angle between heading and travel.",
+    ),
+    (
+        "trajectories.png",
+        "Some episodes from above, on the hardest level",
+        "Tiles from above, a row a family, with the ways of some robots from start to goal.",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Film:
+    """One filmed episode on the page.
+
+    Attributes:
+        row: of episodes.csv.
+        diagnosis: its row of diagnosis.csv, if there is one.
+        file: the film's name in the results folder, None if there is no film.
+        uri: the film, None if there is none or the page has no room for it.
+        sheet: data URI, or None.
+    """
+
+    row: Row
+    diagnosis: Row | None
+    file: str | None
+    uri: str | None
+    sheet: str | None
+
+
+def data_uri(path: Path) -> str:
+    """A PNG, GIF or MP4 as a data URI.
+
+    Raises:
+        OSError: it cannot be read.
+        KeyError: a file of another kind.
+    """
+    kind = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}[path.suffix]
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
+
+
+def describe_condition(condition: Condition) -> str:
+    """What a condition changes, for people."""
+    changes = []
+    if condition.levels is not None:
+        changes.append(f"levels {', '.join(map(str, condition.levels))}")
+    if condition.families is not None:
+        changes.append(f"terrain {', '.join(condition.families)}, which nothing was trained on")
+    if condition.friction is not None:
+        changes.append(f"friction {condition.friction:g}")
+    if condition.payload > 0.0:
+        changes.append(f"{condition.payload:g} kg on the trunk")
+    if condition.push_speed > 0.0:
+        changes.append(f"pushes of {condition.push_speed:g} m/s every {PUSH_INTERVAL:g} s")
+    if condition.motor != 1.0:
+        changes.append(f"{condition.motor:g} times the torque limits and gains of the joints")
+    if condition.latency > 0.0:
+        changes.append(f"commands reach the joints {1000 * condition.latency:g} ms late")
+    if condition.physics_hz is not None:
+        changes.append(f"physics at {condition.physics_hz} Hz")
+    return "; ".join(changes) or "nothing"
+
+
+def _rows(path: Path) -> list[Row]:
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _distinct(rows: Sequence[Row], column: str) -> list[str]:
+    """What stands in a column, each once, in order."""
+    return list(dict.fromkeys(row[column] for row in rows))
+
+
+def _conditions(episodes: Sequence[Row]) -> list[dict[str, Any]]:
+    """Of each condition its name, what it changes, where it was run, how large its cells are, and
+    how each policy's episodes ended.
+
+    Raises:
+        ValueError: a condition that there is not.
+    """
+    result = []
+    for name in _distinct(episodes, "condition"):
+        if name not in CONDITIONS:
+            allowed = ", ".join(CONDITIONS)
+            raise ValueError(f"episodes.csv has condition '{name}'; allowed: {allowed}")
+        rows = [r for r in episodes if r["condition"] == name]
+        cells = Counter((r["policy"], r["family"], r["level"]) for r in rows)
+        outcomes: dict[str, Counter[str]] = {}
+        for r in rows:
+            outcomes.setdefault(r["policy"], Counter())[r["outcome"]] += 1
+        result.append(
+            {
+                "name": name,
+                "changes": describe_condition(CONDITIONS[name]),
+                "families": ", ".join(_distinct(rows, "family")),
+                "levels": ", ".join(_distinct(rows, "level")),
+                "episodes": ", ".join(str(n) for n in sorted(set(cells.values()))),
+                "outcomes": outcomes,
+            }
+        )
+    return result
+
+
+def _diagnoses(diagnoses: Sequence[Row], episodes: Sequence[Row]) -> list[dict[str, Any]]:
+    """Of each policy and condition its failures: by family and level, and where most is to be won.
+
+    A layer's points are the failures that it is to blame for, in per cent of all episodes.
+    """
+    result = []
+    for policy, condition in dict.fromkeys((e["policy"], e["condition"]) for e in episodes):
+        mine = [d for d in diagnoses if (d["policy"], d["condition"]) == (policy, condition)]
+        total = sum((e["policy"], e["condition"]) == (policy, condition) for e in episodes)
+        cells = []
+        for family, level in dict.fromkeys((d["family"], d["level"]) for d in mine):
+            cell = [d for d in mine if (d["family"], d["level"]) == (family, level)]
+            layers = Counter(d["layer"] for d in cell)
+            cause, times = Counter(d["cause"] for d in cell).most_common(1)[0]
+            cells.append(
+                {
+                    "family": family,
+                    "level": level,
+                    "layers": [layers[layer] for layer in LAYERS],
+                    "cause": cause,
+                    "times": times,
+                }
+            )
+        worst = Counter((d["family"], d["layer"]) for d in mine).most_common(1)
+        result.append(
+            {
+                "policy": policy,
+                "condition": condition,
+                "failures": len(mine),
+                "total": total,
+                "cells": cells,
+                "most": [(*where, 100 * count / total) for where, count in worst],
+            }
+        )
+    return result
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """A tuning's keys as ``--set`` takes them, with their values."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, json.dumps(value)
+
+
+def _tuning(path: Path) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    found = _json(path)
+    effect = [
+        {
+            "condition": condition,
+            "policies": {k: v for k, v in figures.items() if isinstance(v, dict)},
+            "tiles": min(f["n"] for f in figures.values() if isinstance(f, dict)),
+            "gained": figures["gained"],
+            "lost": figures["lost"],
+        }
+        for condition, figures in found["effect"].items()
+    ]
+    return {"changes": list(_flat(found["tuning"])), "effect": effect}
+
+
+def film_stem(row: Row) -> str:
+    """The name of the films of a row of episodes.csv or diagnosis.csv."""
+    level, episode, seed = (int(row[key]) for key in ("level", "episode", "seed"))
+    where = row["policy"], row["condition"], row["family"]
+    return EpisodeRecord(*where, level, episode, seed, row["outcome"]).name
+
+
+def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> Film:
+    """What is in ``folder`` of an episode; its film only if it has at most ``room`` bytes."""
+    stem = film_stem(row)
+    kinds = (folder / f"film_{stem}.mp4", folder / f"film_{stem}.gif")
+    path = next((path for path in kinds if path.is_file()), None)
+    sheet = folder / f"sheet_{stem}.png"
+    return Film(
+        row,
+        diagnosis,
+        file=path.name if path else None,
+        uri=data_uri(path) if path and path.stat().st_size <= room else None,
+        sheet=data_uri(sheet) if sheet.is_file() else None,
+    )
+
+
+def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> list[dict[str, Any]]:
+    """The first filmed tile of each family, with its strip and its films under every policy.
+
+    Args:
+        folder: ``films/`` of a results folder.
+        episodes: the filmed ones.
+        diagnoses: of any episodes.
+    """
+    causes = {film_stem(d): d for d in diagnoses}
+    room = FILM_BYTES
+    tiles = []
+    for family in _distinct(episodes, "family"):
+        first = next(r for r in episodes if r["family"] == family)
+        where = [first[key] for key in _TILE]
+        films = []
+        for row in episodes:
+            if [row[key] for key in _TILE] == where:
+                film = _film(folder, row, causes.get(film_stem(row)), room)
+                films.append(film)
+                if film.file and film.uri:
+                    room -= (folder / film.file).stat().st_size
+        suffix = "" if first["condition"] == "nominal" else f"_{first['condition']}"
+        strip = folder / f"strip_{file_label(family)}_{first['level']}{suffix}.png"  # of episode 0
+        shown = first["episode"] == "0" and strip.is_file()
+        tiles.append({**first, "films": films, "strip": data_uri(strip) if shown else None})
+    return tiles
+
+
+def render(folder: Path) -> str:
+    """The page about the evaluation whose results are in ``folder``.
+
+    Of the folder's files summary.json, episodes.csv and the figures must be there. diagnosis.csv,
+    tuning.json and films/ are shown if they are.
+
+    Raises:
+        OSError: a file is missing or cannot be read.
+        ValueError: a file holds what an evaluation does not write.
+    """
+    summary, episodes = _json(folder / "summary.json"), _rows(folder / "episodes.csv")
+    has_diagnoses = (folder / "diagnosis.csv").is_file()
+    diagnoses = _rows(folder / "diagnosis.csv") if has_diagnoses else []
+    films = folder / "films"
+    filmed = [r for r in episodes if any(films.glob(f"*_{glob.escape(film_stem(r))}.*"))]
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html").render(
+        version=tdgc.__version__,
+        policies=_distinct(episodes, "policy"),
+        seeds=_distinct(episodes, "seed"),
+        count=len(episodes),
+        summary=summary,
+        conditions=_conditions(episodes),
+        outcomes=OUTCOMES,
+        figures=[(data_uri(folder / name), title, alt) for name, title, alt in FIGURES],
+        layers=LAYERS,
+        diagnoses=_diagnoses(diagnoses, episodes) if has_diagnoses else None,
+        tuning=_tuning(folder / "tuning.json"),
+        tiles=_tiles(films, filmed, diagnoses),
+        filmed=len(filmed),
+        horizon=HORIZON,
+        goal_radius=GOAL_RADIUS,
+        fall_height=FALL_HEIGHT,
+        trunk_force=TRUNK_FORCE,
+    )
+
+
+def write(folder: Path) -> Path:
+    """Write ``report.html`` into ``folder``, whole or not at all; its path.
+
+    Raises:
+        OSError, ValueError: as ``render``, or the page cannot be written.
+    """
+    path = folder / NAME
+    partial = path.with_suffix(f".{os.getpid()}.tmp")
+    text = render(folder)
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path

@@ -1,0 +1,1 @@
+"""The simulated world: terrain, robot, gaits and the commands that drive it."""

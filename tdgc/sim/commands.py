@@ -1,0 +1,147 @@
+"""The 15 commands and the decoder D from 13 actions (paper Sec. IV-B).
+
+======  =============  =====  ==================================================
+index   name           unit   meaning
+======  =============  =====  ==================================================
+0       vx             m/s    forward velocity in the heading frame
+1       vy             m/s    leftward velocity in the heading frame
+2       yaw_rate       rad/s  turning left is positive
+3       body_height    m      added to the standing height
+4       frequency      Hz     gait cycles a second
+5       duration       1      duty factor: share of a cycle in stance
+6       swing_height   m      apex of a swing foot above the ground
+7       pitch          rad    nose down is positive
+8       roll           rad    left side up is positive
+9       stance_width   m      between left and right footholds
+10      stance_length  m      between front and rear footholds
+11      power_weight   1/W    price of mechanical power, the auxiliary command
+12-14   phase, offset, bound  the gait's embedding e(g), see ``tdgc.sim.gaits``
+======  =============  =====  ==================================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tdgc.config import CommandRanges
+from tdgc.sim.gaits import GAITS, gait_embedding
+
+CONTINUOUS = tuple(f.name for f in dataclasses.fields(CommandRanges))
+NAMES = (*CONTINUOUS, "phase", "offset", "bound")
+UNITS = (
+    "m/s", "m/s", "rad/s", "m", "Hz", "1", "m", "rad", "rad", "m", "m", "1/W", "1", "1", "1"
+)  # fmt: skip
+NUM_ACTIONS = len(CONTINUOUS) + 1  # 12 continuous and the gait channel
+NUM_COMMANDS = len(NAMES)
+#: Position of each command in the vector, by name.
+INDEX = {name: i for i, name in enumerate(NAMES)}
+
+
+def default_command() -> NDArray[np.float64]:
+    """Standing still in trot with middling behaviour parameters, (15,).
+
+    0.08 m of swing and 3 Hz are the defaults of Walk These Ways; footholds under the hips.
+    """
+    command = np.zeros(NUM_COMMANDS)
+    command[INDEX["frequency"]] = 3.0
+    command[INDEX["duration"]] = 0.5
+    command[INDEX["swing_height"]] = 0.08
+    command[INDEX["stance_width"]] = 0.25
+    command[INDEX["stance_length"]] = 0.38
+    command[12:] = gait_embedding(0)
+    return command
+
+
+#: Unit in which the networks see a command's distance from its default: about half its range, so
+#: that every input spans about [-1, 1]; the embedding enters as it is.
+_OBSERVATION_UNIT: NDArray[np.float64] = np.array(
+    [1.0, 0.5, 1.0, 0.1, 1.0, 0.1, 0.1, 0.3, 0.2, 0.1, 0.05, 0.002, 0.5, 0.5, 0.5]
+)
+_OBSERVATION_ZERO: NDArray[np.float64] = np.concatenate([default_command()[:12], np.zeros(3)])
+
+
+def observed_command(command: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Commands (..., 15) as the low level's network sees them."""
+    return np.asarray((command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT)
+
+
+def commands_of(observed: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The inverse: commands (..., 15) from what the network sees of them."""
+    return np.asarray(observed * _OBSERVATION_UNIT + _OBSERVATION_ZERO)
+
+
+class CommandDecoder:
+    """D: 13 actions -> 15 commands, affine within explicit bounds (paper Sec. IV-B).
+
+    Attributes:
+        names: the 15 command names.
+        low, high: (15,) bounds l_j and u_j; the embedding is within [0, 0.5].
+        units: the 15 units.
+        action_limit: a_max, the clip of the raw action.
+    """
+
+    names = NAMES
+    units = UNITS
+
+    def __init__(self, ranges: CommandRanges | None = None, action_limit: float = 1.0) -> None:
+        if not action_limit > 0.0:
+            raise ValueError(f"action_limit must be positive, not {action_limit}")
+        bounds = np.array(dataclasses.astuple(ranges or CommandRanges()), dtype=np.float64)
+        self.low = np.concatenate([bounds[:, 0], np.zeros(3)])
+        self.high = np.concatenate([bounds[:, 1], np.full(3, 0.5)])
+        self.action_limit = action_limit
+
+    def normalise(self, action: ArrayLike) -> NDArray[np.float64]:
+        """x = clip(a, -a_max, a_max) / a_max.
+
+        Raises:
+            ValueError: a last axis other than 13, or a value that is not finite.
+        """
+        raw = np.asarray(action, dtype=np.float64)
+        if raw.shape[-1:] != (NUM_ACTIONS,):
+            raise ValueError(f"an action has {NUM_ACTIONS} values, not shape {raw.shape}")
+        if not np.isfinite(raw).all():
+            raise ValueError("an action must be finite; it has NaN or infinite values")
+        return np.clip(raw, -self.action_limit, self.action_limit) / self.action_limit
+
+    def gait(self, action: ArrayLike) -> NDArray[np.int64]:
+        """g = clip(floor(2 (x_g + 1)), 0, 3): (..., 13) -> (...)."""
+        x = self.normalise(action)[..., -1]
+        return np.clip(np.floor(2.0 * (x + 1.0)), 0, len(GAITS) - 1).astype(np.int64)
+
+    def decode(self, action: ArrayLike) -> NDArray[np.float64]:
+        """c = [l + (x + 1) / 2 (u - l), e(g)]: (..., 13) -> (..., 15).
+
+        Raises:
+            ValueError: a last axis other than 13, or a value that is not finite.
+        """
+        x = self.normalise(action)[..., :-1]
+        low, high = self.low[:12], self.high[:12]
+        continuous = low + 0.5 * (x + 1.0) * (high - low)
+        return np.concatenate([continuous, gait_embedding(self.gait(action))], axis=-1)
+
+    def encode(self, command: ArrayLike) -> NDArray[np.float64]:
+        """The action in the middle of those that decode to ``command``: (..., 15) -> (..., 13).
+
+        Raises:
+            ValueError: a command outside the bounds, named with them.
+        """
+        c = np.asarray(command, dtype=np.float64)
+        for j, name in enumerate(CONTINUOUS):
+            inside = (self.low[j] <= c[..., j]) & (c[..., j] <= self.high[j])
+            if not inside.all():
+                worst = c[..., j][~inside].flat[0]
+                raise ValueError(f"{name} {worst} is outside [{self.low[j]}, {self.high[j]}]")
+        low, high = self.low[:12], self.high[:12]
+        x = 2.0 * (c[..., :12] - low) / np.where(high > low, high - low, 1.0) - 1.0
+        gait = (gait_index(c)[..., None] + 0.5) / 2.0 - 1.0
+        return self.action_limit * np.concatenate([x, gait], axis=-1)
+
+
+def gait_index(commands: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Gait index of commands (..., 15) -> (...), the inverse of ``gait_embedding``."""
+    phase, offset, bound = (commands[..., i] > 0.25 for i in (12, 13, 14))
+    return np.where(phase, 0, np.where(bound, 2, np.where(offset, 3, 1))).astype(np.int64)

@@ -1,0 +1,315 @@
+"""The executor that both levels share: robots in a world, driven by commands and actions.
+
+``Locomotion`` turns low-level actions into joint targets, keeps the phase clock and the histories,
+applies domain randomisation and builds the low level's observation s^L of Sec. IV-A. It knows
+nothing of rewards or tasks; ``tdgc.tasks.low_env`` trains on it and ``tdgc.tasks.high_env`` drives
+it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
+from tdgc.sim.commands import INDEX, NUM_COMMANDS, default_command, gait_index, observed_command
+from tdgc.sim.gaits import GAITS, PhaseClock
+from tdgc.sim.robot import (
+    NUM_JOINTS,
+    Array,
+    commanded_pose,
+    foot_kinematics,
+    joint_targets,
+    nominal_pose,
+    yaw_quaternion,
+)
+from tdgc.sim.terrain import TileField
+from tdgc.sim.world import World
+from tdgc.state import State, copies, fill
+
+SPEED_SCALE = 0.05  # joint speed as the networks see it (Walk These Ways)
+GYRO_SCALE = 0.25  # angular velocity likewise
+_FREQUENCY = INDEX["frequency"]
+_HISTORY = 3  # control steps of targets kept: the step, and two before for latency up to 40 ms
+
+#: Names and sizes of the actor's observation in order: s^L of Sec. IV-A.
+ACTOR_LAYOUT = (
+    ("gravity", 3),
+    ("joint_error", NUM_JOINTS),
+    ("joint_speed", NUM_JOINTS),
+    ("last_action", NUM_JOINTS),
+    ("action_before", NUM_JOINTS),
+    ("command", NUM_COMMANDS),
+    ("clock", 4),
+    ("gait", 1),
+)
+GYRO_LAYOUT = (("gyro", 3),)
+
+_LEG_SWAP = (1, 0, 3, 2)
+_JOINT_SWAP = tuple(3 * leg + j for leg in _LEG_SWAP for j in range(3))
+_JOINT_SIGN = (-1.0, 1.0, 1.0) * 4
+_COMMAND_SIGN = tuple(
+    -1.0 if i in (INDEX["vy"], INDEX["yaw_rate"], INDEX["roll"]) else 1.0
+    for i in range(NUM_COMMANDS)
+)
+_IDENTITY = {n: tuple(range(n)) for n in (1, 3, NUM_COMMANDS)}
+
+#: How each part of an observation looks in a left-right mirror: (source index, sign).
+MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
+    "gravity": (_IDENTITY[3], (1.0, -1.0, 1.0)),
+    "joint_error": (_JOINT_SWAP, _JOINT_SIGN),
+    "joint_speed": (_JOINT_SWAP, _JOINT_SIGN),
+    "last_action": (_JOINT_SWAP, _JOINT_SIGN),
+    "action_before": (_JOINT_SWAP, _JOINT_SIGN),
+    "command": (_IDENTITY[NUM_COMMANDS], _COMMAND_SIGN),
+    "clock": (_LEG_SWAP, (1.0,) * 4),
+    "gait": (_IDENTITY[1], (1.0,)),
+    "gyro": (_IDENTITY[3], (-1.0, 1.0, -1.0)),
+}
+
+
+def mirror_map(
+    layout: tuple[tuple[str, int], ...],
+    mirrors: dict[str, tuple[tuple[int, ...], tuple[float, ...]]],
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Index and sign with which ``sign * x[..., index]`` is ``x`` seen in a mirror."""
+    index: list[int] = []
+    sign: list[float] = []
+    for name, size in layout:
+        source, signs = mirrors[name]
+        assert len(source) == len(signs) == size, name
+        index += [len(sign) + s for s in source]
+        sign += signs
+    return np.array(index), np.array(sign, dtype=np.float32)
+
+
+def action_mirror() -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The same for the 12 actions."""
+    return np.array(_JOINT_SWAP), np.array(_JOINT_SIGN, dtype=np.float32)
+
+
+class Locomotion:
+    """M robots that take 12 actions each 20 ms and follow 15 commands.
+
+    They are in a new Bullet world, or in ``world`` if there is one.
+
+    Attributes:
+        command: (M, 15), to be set by the caller.
+        actions: (2, M, 12), the last clipped action and the one before.
+        targets: (3, M, 12) rad, joint targets of the last step and the two before.
+        delay: (M,) s of latency; joint_offset: (M, 12) rad; friction, payload: (M,); armature:
+            (M,) kg m^2.
+    """
+
+    def __init__(
+        self,
+        num_robots: int,
+        robot: RobotConfig,
+        physics: PhysicsConfig,
+        field: TileField | None,
+        gyro: bool = False,
+        visual: bool = False,
+        world: World | None = None,
+    ) -> None:
+        self.num_robots = num_robots
+        self.robot = robot
+        self.physics = physics
+        self.gyro = gyro
+        self.world = world or World(num_robots, robot, physics, field, visual)
+        self.clock = PhaseClock(num_robots)
+        self.nominal = nominal_pose(robot)
+        self.command = np.tile(default_command(), (num_robots, 1))
+        self.actions = np.zeros((2, num_robots, NUM_JOINTS))
+        self.targets = np.tile(self.nominal, (_HISTORY, num_robots, 1))
+        self.delay = np.zeros(num_robots)
+        self.joint_offset = np.zeros((num_robots, NUM_JOINTS))
+        self.friction = np.full(num_robots, physics.friction)
+        self.payload = np.zeros(num_robots)
+        self.armature = np.zeros(num_robots)
+        geometry = self.world.state.geometry
+        # Feet in the nominal pose, (1, 4, 3) m, and how high the trunk is above their soles.
+        self._feet, _ = foot_kinematics(geometry, self.nominal[None], np.zeros((1, NUM_JOINTS)))
+        self._stand = geometry.foot_radius - self._feet[0, :, 2].min()
+        self._pose = self._pose_of = np.empty(0)  # the last ``pose`` and what it followed from
+
+    @property
+    def layout(self) -> tuple[tuple[str, int], ...]:
+        """Names and sizes of the parts of ``observe``'s rows."""
+        return ACTOR_LAYOUT + (GYRO_LAYOUT if self.gyro else ())
+
+    def swing(self) -> Array:
+        """Profile of the swing, (M, 4): height of each foot as a share of the commanded apex."""
+        return self.clock.swing(self.robot.swing_ramp)
+
+    def executed(self) -> Array:
+        """The commands as they are carried out now, (M, 15): a gait begins no slower than
+        ``start_frequency``. At 2 Hz pronk and bound fly for a quarter of a second, and a robot's
+        first jump is too weak for that."""
+        begun, asked = self.clock.begun(self.robot.start_cycles), self.command[:, _FREQUENCY]
+        command = self.command.copy()
+        command[:, _FREQUENCY] += (1.0 - begun) * np.maximum(self.robot.start_frequency - asked, 0)
+        return command
+
+    def pose(self) -> Array:
+        """q0, the pose that actions start from and joint errors refer to, (M, 12) rad."""
+        if not self.robot.commanded_pose:
+            return np.tile(self.nominal, (self.num_robots, 1))
+        # An action is taken from the pose that was observed, if nobody changed anything between.
+        swing = self.swing()
+        follows = np.concatenate([self.command, swing], axis=1)
+        if not np.array_equal(follows, self._pose_of):
+            geometry = self.world.state.geometry
+            self._pose = commanded_pose(self.robot, geometry, self.command, swing)
+            self._pose_of = follows
+            self._pose.setflags(write=False)
+        return self._pose
+
+    def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:
+        """Stand the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)
+        rad, with their clocks at ``clock`` (n,), and forget their histories."""
+        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        foot_x = xy[:, :1] + c * self._feet[..., 0] - s * self._feet[..., 1]
+        foot_y = xy[:, 1:] + s * self._feet[..., 0] + c * self._feet[..., 1]
+        ground = self.world.ground_height(foot_x, foot_y).max(axis=1)
+        position = np.column_stack([xy, ground + self._stand])
+        pose = np.tile(self.nominal, (len(index), 1))
+        self.world.reset_robots(index, position, yaw_quaternion(yaw), pose)
+        self.actions[:, index] = 0.0
+        self.targets[:, index] = self.nominal
+        self.clock.reset(index, clock)
+        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
+
+    def randomise(
+        self,
+        index: NDArray[np.integer],
+        config: RandomisationConfig,
+        rng: np.random.Generator,
+        width: Array | float = 1.0,
+    ) -> None:
+        """Draw the physical parameters of the robots ``index`` about their nominal values.
+
+        ``width`` (n,) scales each robot's ranges, as ``config.scale`` does all.
+        """
+        n = len(index)
+        scale = np.broadcast_to(config.scale * np.asarray(width), n)
+
+        def draw(bounds: Range, nominal: float, shape: tuple[int, ...] = (n,)) -> Array:
+            drawn = rng.uniform(*bounds, size=shape) - nominal
+            return nominal + (scale * drawn.T).T
+
+        self.friction[index] = draw(config.friction, self.physics.friction)
+        self.payload[index] = draw(config.payload, 0.0)
+        self.world.strength[index, 0] = draw(config.motor_strength, 1.0)
+        self.joint_offset[index] = draw(config.joint_offset, 0.0, (n, NUM_JOINTS))
+        self.delay[index] = draw(config.latency, 0.0)
+        self.armature[index] = draw(config.armature, 0.0)
+        self.world.joint_friction[index, 0] = draw(config.joint_friction, 0.0)
+        self.apply_dynamics(index)
+
+    def apply_dynamics(self, index: NDArray[np.integer]) -> None:
+        """Bring friction, payload and armature of the robots ``index`` into Bullet."""
+        self.world.set_dynamics(
+            index, self.friction[index], self.payload[index], self.armature[index]
+        )
+
+    def act(self, actions: NDArray[np.floating]) -> None:
+        """One control step: clip, scale, delay, PD control in Bullet, clock (Sec. IV-A).
+
+        Args:
+            actions: (M, 12).
+
+        Raises:
+            ValueError: a value that is not finite.
+        """
+        if not np.isfinite(actions).all():
+            raise ValueError("an action must be finite; it has NaN or infinite values")
+        limit = self.robot.action_limit
+        clipped = np.clip(np.asarray(actions, dtype=np.float64), -limit, limit)
+        self.actions = np.stack([clipped, self.actions[0]])
+        geometry = self.world.state.geometry
+        targets = joint_targets(self.robot, geometry, self.pose(), clipped)
+        self.targets = np.concatenate([targets[None], self.targets[:-1]])
+        self.world.step(self.targets, self.delay, self.joint_offset)
+        self.clock.advance(
+            self.physics.control_dt,
+            self.executed()[:, _FREQUENCY],
+            self.command[:, 12:],
+            self.command[:, INDEX["duration"]],
+        )
+
+    def _arrays(self) -> dict[str, Array]:
+        """All that one step leaves for the next but what Bullet remembers of contacts."""
+        fields = dataclasses.fields(self.world.state)
+        measured = [f.name for f in fields if f.init and f.name != "geometry"]
+        return {
+            "command": self.command,
+            "actions": self.actions,
+            "targets": self.targets,
+            "clock": self.clock.clock,
+            "cycles": self.clock.cycles,
+            "gait": self.clock.embedding,
+            "delay": self.delay,
+            "joint_offset": self.joint_offset,
+            "friction": self.friction,
+            "payload": self.payload,
+            "armature": self.armature,
+            "strength": self.world.strength,
+            "joint_friction": self.world.joint_friction,
+            **{name: getattr(self.world.state, name) for name in measured},
+        }
+
+    def state_dict(self) -> State:
+        """Everything of the robots, as copies; the ground is the caller's."""
+        return copies(self._arrays())
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on from a ``state_dict``, as a ``World.forget`` there would have gone on.
+
+        Raises:
+            ValueError: a state of other robots.
+        """
+        fill(self._arrays(), state)
+        self.world.state.derive()
+        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
+        self.apply_dynamics(np.arange(self.num_robots))
+        self.world.forget()
+
+    def observe(
+        self,
+        noise: RandomisationConfig | None = None,
+        rng: np.random.Generator | None = None,
+    ) -> NDArray[np.float32]:
+        """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g], (M, 71), and 3 more with a gyro.
+
+        With ``noise`` and ``rng`` the measured parts carry uniform noise.
+        """
+        state = self.world.state
+        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
+        gravity = state.gravity
+        error = state.q - self.joint_offset - self.pose()
+        speed = state.qd
+        gyro = np.einsum("mji,mj->mi", state.rotation, state.ang_vel)
+        if noise is not None and rng is not None:
+
+            def jitter(like: Array, width: float) -> Array:
+                return noise.scale * width * rng.uniform(-1.0, 1.0, like.shape)
+
+            gravity = gravity + jitter(gravity, noise.noise_gravity)
+            error = error + jitter(error, noise.noise_joint_angle)
+            speed = speed + jitter(speed, noise.noise_joint_speed)
+            gyro = gyro + jitter(gyro, noise.noise_gyro)
+        parts = [
+            gravity,
+            error,
+            SPEED_SCALE * speed,
+            self.actions[0],
+            self.actions[1],
+            observed_command(self.executed()),
+            self.clock.signal(),
+            gait_index(self.command)[:, None] / (len(GAITS) - 1),
+        ]
+        if self.gyro:
+            parts.append(GYRO_SCALE * gyro)
+        return np.concatenate(parts, axis=1).astype(np.float32)

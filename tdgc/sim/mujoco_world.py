@@ -1,0 +1,264 @@
+"""A robot on its tile in MuJoCo: the only module that imports mujoco.
+
+Robot, ground and joint control are those of the Bullet world: the same URDF, the same surface and
+the same PD law. Contacts, integration and the motors' rotors are MuJoCo's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
+from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.sim.robot import Array, RobotState, pd_torque, rotation_matrix
+from tdgc.sim.terrain import TileField
+from tdgc.sim.world import GRAVITY, World, check_display
+
+_CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
+_NAME = "ground"
+_BASE = 0.5  # m of ground under its lowest point: MuJoCo's height fields are solid
+_GROUND, _TRUNK, _FOOT, _LEG = (
+    -1,
+    0,
+    1,
+    5,
+)  # parts of a contact; a foot and a leg above it, plus 0-3
+
+
+@dataclass(frozen=True)
+class MujocoConfig:
+    """MuJoCo's settings; docs/mujoco.md has what each costs."""
+
+    timestep: float = 0.0025  # s, Bullet's on terrain
+    # s and none, of all contacts and joint limits. At MuJoCo's default of 0.02 s feet sink into the
+    # ground and robots fall over stairs.
+    solref: float = 0.005
+    # With friction pyramids and MuJoCo's impratio of 1 feet creep: robots slide off slopes.
+    cone: Literal["elliptic", "pyramidal"] = "elliptic"
+    impratio: float = 100.0
+    friction: float = 0.8  # foot on ground, nominal (benchmark)
+    armature: float = (
+        0.01  # kg m^2 about each joint, of its motor's rotor: as in models of such robots
+    )
+    joint_friction: float = 0.0  # N m in each joint, dry
+
+    def physics(self, control_dt: float, joint_rate: float) -> PhysicsConfig:
+        """The steps of control, joint control and physics.
+
+        Args:
+            control_dt: s, a control step.
+            joint_rate: Hz at which joint torques are computed.
+
+        Raises:
+            ConfigError: ``timestep`` does not divide the joint control's step.
+        """
+        substeps, hold = round(control_dt / self.timestep), round(1.0 / joint_rate / self.timestep)
+        if not np.allclose(
+            [substeps * self.timestep, hold * self.timestep * joint_rate], [control_dt, 1.0]
+        ):
+            raise ConfigError(
+                f"'timestep' must divide the joint control's step, {1.0 / joint_rate:g} s, not "
+                f"{self.timestep:g}"
+            )
+        return PhysicsConfig(control_dt, substeps, hold, friction=self.friction)
+
+
+class MujocoWorld(World):
+    """One robot on the only tile of a field, simulated by MuJoCo instead of Bullet.
+
+    Of ``World`` it has the robot's ``state``, its placing and the ground's heights, no more.
+
+    Args:
+        robot: its URDF, gains and limits.
+        physics: from ``config``.
+        field: (1, 1) tiles.
+        config: MuJoCo's settings.
+        visual: keep what only a window shows.
+
+    Raises:
+        ConfigError: a URDF that MuJoCo cannot load.
+    """
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        physics: PhysicsConfig,
+        field: TileField,
+        config: MujocoConfig,
+        visual: bool = False,
+    ) -> None:
+        self.num_robots, self.robot, self.physics, self.field = 1, robot, physics, field
+        self.strength = np.ones((1, 1))
+        self.state = RobotState.zeros(read_geometry(robot), 1)
+        self.model = _build(robot, field, config, visual)
+        self.data = mujoco.MjData(self.model)
+        joints = [self.model.joint(name) for name in JOINTS]
+        self._q = np.array([joint.qposadr[0] for joint in joints])
+        self._qd = np.array([joint.dofadr[0] for joint in joints])
+        self._part = self._parts()
+
+    def _parts(self) -> NDArray[np.int64]:
+        """What each geom is part of, as codes of this module."""
+        model = self.model
+        carrier = model.body_weldid[model.geom_bodyid]  # what is fixed to a link belongs to it
+        parts = np.where(model.geom_bodyid == 0, _GROUND, _TRUNK)
+        for k, name in enumerate(JOINTS):
+            parts[carrier == model.joint(name).bodyid[0]] = _LEG + k // 3
+        mujoco.mj_kinematics(model, self.data)
+        feet = self.state.foot_body[0]  # at joint angles 0 and the trunk at the origin, as there
+        for leg in range(4):
+            mine = np.flatnonzero(parts == _LEG + leg)
+            away = np.linalg.norm(self.data.geom_xpos[mine] - feet[leg], axis=1)
+            parts[mine[away.argmin()]] = _FOOT + leg
+        return parts
+
+    def _put(self, i: int) -> None:
+        """Bring the robot of MuJoCo to where ``state`` has it."""
+        state, data = self.state, self.data
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:3], data.qpos[3:7] = state.position[i], np.roll(state.quaternion[i], 1)
+        data.qvel[:3], data.qvel[3:6] = state.lin_vel[i], state.rotation[i].T @ state.ang_vel[i]
+        data.qpos[self._q], data.qvel[self._qd] = state.q[i], state.qd[i]
+        mujoco.mj_forward(self.model, data)
+
+    def control(self, targets: Array) -> None:
+        """One control step of PD control to the joint targets (12,) rad; refreshes ``state``."""
+        model, data, state = self.model, self.data, self.state
+        state.trunk_force[0] = 0.0
+        for _ in range(self.physics.joint_steps):
+            error, speed = targets - data.qpos[self._q], data.qvel[self._qd]
+            state.torque = pd_torque(error[None], speed[None], self.strength, self.robot)
+            data.qfrc_applied[self._qd] = state.torque[0]
+            for _ in range(self.physics.hold):
+                mujoco.mj_step(model, data)
+                force = self._contact_force()
+                state.trunk_force[0] = max(force[_TRUNK], state.trunk_force[0])
+        state.foot_force[0], state.leg_force[0] = force[_FOOT:_LEG], force[_LEG:]
+        state.position[0], state.quaternion[0] = data.qpos[:3], np.roll(data.qpos[3:7], -1)
+        state.q[0], state.qd[0] = data.qpos[self._q], data.qvel[self._qd]
+        state.lin_vel[0] = data.qvel[:3]
+        state.ang_vel[0] = rotation_matrix(state.quaternion)[0] @ data.qvel[3:6]
+        state.derive()
+
+    def _contact_force(self) -> Array:
+        """Normal force of the last physics step on the trunk, the feet and the legs, (9,) N."""
+        force, wrench = np.zeros(_LEG + 4), np.zeros(6)
+        parts = self._part[self.data.contact.geom].max(axis=1)  # the robot's, not the ground's
+        for k, part in enumerate(parts):
+            mujoco.mj_contactForce(self.model, self.data, k, wrench)
+            force[part] += wrench[0]
+        return force
+
+    def deepest(self) -> float:
+        """How far a foot is under the surface, m; 0 or less if none is."""
+        feet = self.state.foot_position[0]
+        ground = self.ground_height(feet[:, 0], feet[:, 1])
+        return float((ground - feet[:, 2]).max() + self.state.geometry.foot_radius)
+
+    def close(self) -> None:
+        """Nothing of MuJoCo needs to be closed."""
+
+
+def _build(
+    robot: RobotConfig, field: TileField, config: MujocoConfig, visual: bool
+) -> mujoco.MjModel:
+    """The robot above its ground."""
+    path = urdf_path(robot)
+    try:
+        spec = (
+            _with_visuals(path.read_text(encoding="utf-8"))
+            if visual
+            else mujoco.MjSpec.from_file(str(path))
+        )
+        spec.compiler.fusestatic = False  # it would weld the trunk to the world
+        spec.worldbody.first_body().add_freejoint()
+        _add_ground(spec, field)
+        _set(spec, config)
+        return spec.compile()
+    except ValueError as error:  # a mesh that is not there, an element it cannot read
+        raise ConfigError(f"{path}: MuJoCo cannot load it: {error}") from error
+
+
+def _with_visuals(urdf: str) -> mujoco.MjSpec:
+    """The robot with its visual shapes, which MuJoCo would leave out; but for those of meshes."""
+    tree = ElementTree.fromstring(urdf)
+    for link in tree.iter("link"):
+        for shape in link.findall("visual"):
+            if shape.find("geometry/mesh") is not None:
+                link.remove(shape)
+    compiler = ElementTree.SubElement(ElementTree.SubElement(tree, "mujoco"), "compiler")
+    compiler.set("discardvisual", "false")
+    return mujoco.MjSpec.from_string(ElementTree.tostring(tree, encoding="unicode"))
+
+
+def _add_ground(spec: mujoco.MjSpec, field: TileField) -> None:
+    """The field's surface. MuJoCo splits a cell along the other diagonal than Bullet, up to 5 mm
+    apart on rough ground, so the field is turned by a quarter: x runs along its columns."""
+    half_x, half_y = 0.5 * field.cell * (np.array(field.heights.shape) - 1)
+    low, high = float(field.heights.min()), float(field.heights.max())
+    spec.add_hfield(
+        name=_NAME,
+        size=[half_y, half_x, high - low or _BASE, _BASE],  # a plane has no heights to scale
+        nrow=field.heights.shape[0],
+        ncol=field.heights.shape[1],
+        userdata=field.heights[::-1].ravel().astype(np.float64),
+    )
+    spec.worldbody.add_geom(
+        name=_NAME,
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname=_NAME,
+        pos=[half_x, half_y, low],
+        quat=[0.5**0.5, 0.0, 0.0, 0.5**0.5],
+        contype=0,
+        conaffinity=1,
+        rgba=[0.87, 0.84, 0.77, 1.0],
+    )
+
+
+def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
+    """Bring the settings into the model."""
+    option = spec.option
+    option.timestep, option.gravity = config.timestep, [0.0, 0.0, -GRAVITY]
+    option.cone, option.impratio = _CONES[config.cone], config.impratio
+    for geom in spec.geoms:
+        geom.solref, geom.condim = [config.solref, 1.0], 3
+        geom.friction[0] = config.friction  # of two in contact MuJoCo takes the larger
+        if (
+            geom.name != _NAME and geom.contype
+        ):  # a robot meets the ground and not itself, as in Bullet
+            geom.conaffinity = 0
+    for joint in spec.joints:
+        if joint.name not in JOINTS:
+            continue
+        # All that moves a joint beside its torque is told here, whatever the URDF says.
+        joint.armature, joint.frictionloss, joint.damping = (
+            config.armature,
+            config.joint_friction,
+            [0.0, 0.0, 0.0],
+        )
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        joint.solref_limit = [config.solref, 1.0]
+
+
+@contextlib.contextmanager
+def window(world: MujocoWorld) -> Iterator[Any]:
+    """MuJoCo's viewer on ``world``; ``sync`` it after each control step.
+
+    Raises:
+        WindowError: no display.
+    """
+    from mujoco import viewer
+
+    check_display()
+    with viewer.launch_passive(world.model, world.data) as shown:
+        shown.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        shown.cam.trackbodyid, shown.cam.distance = 1, 2.0
+        yield shown

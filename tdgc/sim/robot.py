@@ -1,0 +1,254 @@
+"""The robot on arrays: nominal pose, joint PD, leg kinematics and the state.
+
+Plain numpy; ``tdgc.sim.world`` fills a ``RobotState`` from Bullet and asks ``pd_torque`` for
+torques.
+Every array has a leading axis of M robots. Legs in the order of ``tdgc.sim.gaits.FEET``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.config import RobotConfig
+from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.geometry import FRONT, JOINTS, SIDE, Geometry
+
+Array = NDArray[np.float64]
+
+NUM_JOINTS = len(JOINTS)
+
+HIGHEST_FOOT = -0.1  # m against the hips: no commanded pose folds a leg further
+
+
+def nominal_pose(config: RobotConfig) -> Array:
+    """q0 of the paper, (12,) rad."""
+    front, rear = config.nominal_thigh
+    thigh = np.where(FRONT > 0, front, rear)
+    return np.stack([config.nominal_hip * SIDE, thigh, np.full(4, config.nominal_calf)], 1).ravel()
+
+
+def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swing: Array) -> Array:
+    """q0(c, phi): the nominal pose bent to the commanded behaviour, (M, 15), (M, 4) -> (M, 12) rad.
+
+    The feet stand under a level trunk of the commanded height, as wide and long apart as asked, and
+    are raised along ``swing``, the profile of ``gaits.swing_profile``, by what the swing height
+    exceeds its default. At default commands it is the paper's q0, on which a policy hardly learned
+    to follow these commands (docs/experiments.md); pitch and roll it learned. It is where actions
+    start from, not a constraint: a foot out of reach is put at the nearest angles that the calf
+    has, and none comes higher than ``HIGHEST_FOOT``.
+    """
+    standing, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
+    change = command - default_command()
+    feet = np.repeat(standing, len(command), axis=0)
+    feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * FRONT
+    feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * SIDE
+    feet[..., 2] -= change[:, INDEX["body_height"], None]
+    feet[..., 2] += change[:, INDEX["swing_height"], None] * swing
+    feet[..., 2] = np.minimum(feet[..., 2], HIGHEST_FOOT)
+    return leg_angles(geometry, feet)
+
+
+def action_scale(config: RobotConfig) -> Array:
+    """alpha of the paper, (12,) rad per unit action: hips move less than thighs and calves."""
+    return config.action_scale * np.tile([config.hip_scale, 1.0, 1.0], 4)
+
+
+def joint_targets(config: RobotConfig, geometry: Geometry, pose: Array, actions: Array) -> Array:
+    """q* = q0 + alpha clip(a, -a_max, a_max): (M, 12) twice -> (M, 12) rad (Sec. IV-A).
+
+    Targets keep ``joint_margin`` from the joint limits, as a motor driver would see to.
+    """
+    clipped = np.clip(actions, -config.action_limit, config.action_limit)
+    return np.clip(pose + action_scale(config) * clipped, *target_limits(config, geometry))
+
+
+def target_limits(config: RobotConfig, geometry: Geometry) -> tuple[Array, Array]:
+    """Lowest and highest joint targets, (12,) rad each; infinite where nothing limits them."""
+    if config.joint_margin is None:
+        return np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
+    low, high = geometry.joint_limits.T
+    return low + config.joint_margin, high - config.joint_margin
+
+
+FRICTION_SPEED = 1.0  # rad/s at which dry friction is whole: a step below it would chatter
+
+
+def pd_torque(
+    error: Array,
+    speed: Array,
+    strength: Array,
+    config: RobotConfig,
+    friction: Array | float = 0.0,
+) -> Array:
+    """Joint torques of the PD law, limited as the motors are, less what the joints' friction takes.
+
+    Args:
+        error: (M, 12) target minus angle, rad.
+        speed: (M, 12) joint speed, rad/s.
+        strength: (M, 1) motor strength, times gains and limits.
+        config: gains and limits.
+        friction: (M, 1) N m, dry friction in each joint.
+
+    Returns:
+        (M, 12) N m. A joint at its speed limit gets no torque that would drive it faster.
+    """
+    limit = np.array(4 * config.torque_limit) * strength
+    torque = strength * (config.kp * error - config.kd * speed)
+    np.minimum(torque, limit, out=torque)  # np.clip takes twice as long for so few
+    np.maximum(torque, -limit, out=torque)
+    fast = np.abs(speed) >= np.array(4 * config.speed_limit)
+    if fast.any():
+        torque[fast & (torque * speed > 0.0)] = 0.0
+    if np.any(friction):
+        torque -= friction * np.clip(speed / FRICTION_SPEED, -1.0, 1.0)
+    return torque
+
+
+def foot_kinematics(geometry: Geometry, q: Array, qd: Array) -> tuple[Array, Array]:
+    """Foot centres and velocities in the trunk's frame: (M, 12) twice -> (M, 4, 3) twice."""
+    angle, rate = q.reshape(-1, 4, 3), qd.reshape(-1, 4, 3)
+    hip, thigh, knee = angle[..., 0], angle[..., 1], angle[..., 1] + angle[..., 2]
+    hip_d, thigh_d, knee_d = rate[..., 0], rate[..., 1], rate[..., 1] + rate[..., 2]
+    st, ct = geometry.thigh * np.sin(thigh), geometry.thigh * np.cos(thigh)
+    sk, ck = geometry.calf * np.sin(knee), geometry.calf * np.cos(knee)
+    x, down = -st - sk, -ct - ck
+    x_d, down_d = -ct * thigh_d - ck * knee_d, st * thigh_d + sk * knee_d
+    sh, ch = np.sin(hip), np.cos(hip)
+    out = geometry.abduction * SIDE
+    y, z = out * ch - down * sh, out * sh + down * ch
+    position = np.stack([x + geometry.hips[:, 0], y + geometry.hips[:, 1], z], axis=-1)
+    velocity = np.stack([x_d, -z * hip_d - down_d * sh, y * hip_d + down_d * ch], axis=-1)
+    return position, velocity
+
+
+def leg_angles(geometry: Geometry, feet: Array) -> Array:
+    """Joint angles that put the foot centres there, the inverse of ``foot_kinematics``.
+
+    Args:
+        geometry: the robot's.
+        feet: (M, 4, 3) m in the trunk's frame, below the hips.
+
+    Returns:
+        (M, 12) rad, each calf within its limits: a leg too short or too long points at its foot.
+    """
+    upper, lower = geometry.thigh, geometry.calf
+    x, y, z = np.moveaxis(feet - np.pad(geometry.hips, ((0, 0), (0, 1))), -1, 0)
+    out = geometry.abduction * SIDE
+    down = np.sqrt(np.maximum(y * y + z * z - out * out, 0.0))  # below the thigh joint, hip at 0
+    hip = wrap_angle(np.arctan2(z, y) - np.arctan2(-down, out))
+    square = x * x + down * down
+    bend = (square - upper * upper - lower * lower) / (2.0 * upper * lower)
+    calf = np.clip(-np.arccos(np.clip(bend, -1.0, 1.0)), *geometry.joint_limits[2::3].T)
+    lean = np.arctan2(lower * np.sin(calf), upper + lower * np.cos(calf))
+    thigh = np.arctan2(-x, down) - lean
+    return np.stack([hip, thigh, calf], axis=-1).reshape(len(feet), NUM_JOINTS)
+
+
+def rotation_matrix(quaternion: Array) -> Array:
+    """Body-to-world rotation of (M, 4) quaternions (x, y, z, w) -> (M, 3, 3)."""
+    x, y, z, w = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def quaternion_product(one: Array, other: Array) -> Array:
+    """Turn by ``other`` and then by ``one``: quaternions (..., 4) twice -> (..., 4)."""
+    (ax, ay, az, aw), (bx, by, bz, bw) = np.moveaxis(one, -1, 0), np.moveaxis(other, -1, 0)
+    return np.stack(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ],
+        axis=-1,
+    )
+
+
+def yaw_quaternion(yaw: Array) -> Array:
+    """Quaternions (M, 4) of upright bodies with heading ``yaw`` (M,) rad."""
+    zero = np.zeros_like(yaw)
+    return np.stack([zero, zero, np.sin(0.5 * yaw), np.cos(0.5 * yaw)], axis=-1)
+
+
+def wrap_angle(angle: Array) -> Array:
+    """Angles brought to [-pi, pi)."""
+    return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
+
+
+@dataclass
+class RobotState:
+    """What Bullet says about M robots after a control step, and what follows from it.
+
+    Attributes:
+        geometry: the robots'.
+        position, quaternion: trunk in the world, (M, 3) m and (M, 4).
+        lin_vel, ang_vel: trunk in the world, (M, 3) m/s and rad/s.
+        q, qd, torque: joints, (M, 12) rad, rad/s and N m (torque of the last physics step).
+        foot_force: normal contact force on each foot, (M, 4) N.
+        leg_force: the same on each leg above the foot (hip, knee and calf), (M, 4) N.
+        trunk_force: largest normal force on the trunk in any physics step, (M,) N.
+    """
+
+    geometry: Geometry
+    position: Array
+    quaternion: Array
+    lin_vel: Array
+    ang_vel: Array
+    q: Array
+    qd: Array
+    torque: Array
+    foot_force: Array
+    leg_force: Array
+    trunk_force: Array
+    rotation: Array = field(init=False)
+    yaw: Array = field(init=False)
+    gravity: Array = field(init=False)
+    heading_vel: Array = field(init=False)
+    foot_body: Array = field(init=False)
+    foot_position: Array = field(init=False)
+    foot_velocity: Array = field(init=False)
+
+    @classmethod
+    def zeros(cls, geometry: Geometry, num_robots: int) -> RobotState:
+        """A state of ``num_robots`` upright robots at the origin."""
+        m = num_robots
+        quaternion = np.zeros((m, 4))
+        quaternion[:, 3] = 1.0
+        arrays = [np.zeros((m, n)) for n in (3, 3, 12, 12, 12, 4, 4)]
+        lin, ang, q, qd, torque, foot, leg = arrays
+        trunk = np.zeros((m, 3)), quaternion, lin, ang
+        state = cls(geometry, *trunk, q, qd, torque, foot, leg, np.zeros(m))
+        state.derive()
+        return state
+
+    def derive(self) -> None:
+        """Fill the fields that follow from the measured ones.
+
+        ``gravity`` is the unit vector of gravity in the body frame, g^b of the paper, (M, 3);
+        ``heading_vel`` the velocity (forward, left, up) in the frame turned by yaw alone, (M, 3);
+        ``foot_body`` the foot centres in the body frame, ``foot_position`` and ``foot_velocity``
+        in the world, (M, 4, 3).
+        """
+        self.rotation = rotation_matrix(self.quaternion)
+        self.yaw = np.arctan2(self.rotation[:, 1, 0], self.rotation[:, 0, 0])
+        self.gravity = -self.rotation[:, 2, :]
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        vx, vy, vz = self.lin_vel.T
+        self.heading_vel = np.stack([c * vx + s * vy, c * vy - s * vx, vz], axis=-1)
+        self.foot_body, foot_vel = foot_kinematics(self.geometry, self.q, self.qd)
+        turned = self.rotation[:, None]
+        arm = (turned @ self.foot_body[..., None])[..., 0]
+        self.foot_position = self.position[:, None] + arm
+        self.foot_velocity = (
+            self.lin_vel[:, None]
+            + np.cross(self.ang_vel[:, None], arm)
+            + (turned @ foot_vel[..., None])[..., 0]
+        )

@@ -1,0 +1,611 @@
+"""Terrain tiles and the curriculum grid (Sec. III-A), in plain numpy.
+
+A tile is a height field h(x, y) of 8 m x 8 m; x is the direction of travel. Along x it reads
+
+    0      1.25   1.5                                     6.5   6.75      8 m
+    | start | band |             challenge zone            | band | goal |
+
+and one number, the difficulty d, scales one geometric parameter per family (Eq. 1). The parameter
+is exact; the layout is drawn for each tile from its own generator. Ranges and shapes are those of
+TDGC-Bench 2. A tile carries its features (trenches, risers, pillars, slope), so that nobody has to
+look for them in the heights. All lengths are in m, all angles in rad; arrays are indexed [ix, iy],
+so sample [ix, iy] lies at (ix * CELL, iy * CELL).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+HeightArray = NDArray[np.float32]
+
+#: Edition of TDGC-Bench that these tiles belong to; in the first one layouts were fixed.
+EDITION = 2
+
+# Families and levels: Sec. III-A; Mixed and the levels past 10 are only ever evaluated on.
+FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
+ALL_FAMILIES = (*FAMILIES, "mixed")
+#: A family whose name ends so is a file with heights of the user's own, see `height_map`.
+MAP_ENDING = ".npy"
+MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1
+OOD_LEVELS = (11, 12)  # out of distribution, d = 1.1 and 1.2
+MAX_DIFFICULTY = OOD_LEVELS[-1] / MAX_LEVEL
+
+# The tile (TDGC-Bench, "Tile").
+TILE_SIZE = 8.0  # m, both ways; the paper's W
+CELL = 0.05  # m, grid resolution
+TILE_SAMPLES = round(TILE_SIZE / CELL) + 1  # 161 a side: both edges carry samples
+START_END = 1.25  # m, the start platform is x in [0, 1.25], at h = 0
+GOAL_BEGIN = 6.75  # m, the goal platform is x in [6.75, 8], at h = 0
+ZONE = (1.5, 6.5)  # m, the challenge zone in x
+BAND = 0.25  # m, transition band between platform and zone
+TILT_BAND = 0.5  # m, Tilt's wider one, half of it inside the zone
+START_X, GOAL_X = 0.75, 7.25  # m
+Y_SPREAD = 1.0  # m, start and goal: y uniform in W/2 +- 1
+YAW_SPREAD = 0.5  # rad, start: yaw uniform in +- 0.5
+
+# p_min and p_max of Eq. (1), at d = 0 and d = 1 (TDGC-Bench, table of families).
+PARAMETER_RANGES: dict[str, tuple[float, float]] = {
+    "rough": (0.01, 0.10),  # amplitude A, m
+    "pillar": (4.0, 24.0),  # number of cylinders in a whole zone
+    "stair": (0.03, 0.15),  # step height h_s, m
+    "gap": (0.05, 0.30),  # mean gap width w, m
+    "tilt": (0.0, 0.45),  # lateral slope angle theta, rad
+}
+
+# What layouts are drawn from, the same at every difficulty (same table).
+LATTICES = (0.1, 0.15, 0.2, 0.25, 0.3)  # m, spacing of the Rough noise
+TREAD_CELLS = (5, 8)  # cells, shortest and longest tread: 0.25-0.40 m
+LANDING_CELLS = 6  # cells, the least landing between up and down: 0.30 m
+TRENCHES = (3, 5)  # fewest and most in a whole zone
+TRENCH_SPACING = 0.75  # m, least distance between two centres
+TRENCH_MARGIN = 0.3  # m, least distance of a centre from the ends of the zone
+TRENCH_DEPTH = 0.6  # m
+PILLAR_DIAMETER = (0.2, 0.4)  # m
+PILLAR_HEIGHT = 0.8  # m
+PILLAR_CLEARANCE = 0.6  # m, free way between any two
+
+# Bullet keeps the height range of a field's first upload, so it is pinned to what any tile can
+# need: Tilt at level 12 reaches W/2 tan(0.54 rad) = 2.40 m either way, everything else less.
+HEIGHT_RANGE = (-2.5, 2.5)  # m
+# btHeightfieldTerrainShape cuts larger fields off without a word.
+MAX_SAMPLES = 2_097_152
+
+# First entry of every tile's seed: the streams differ here, so no training tile is ever an
+# evaluation tile, whatever the seeds. The values only have to differ.
+TRAIN_STREAM = 1
+EVAL_STREAM = 2
+
+_X = np.arange(TILE_SAMPLES) / round(1 / CELL)  # m; i / 20 is exact wherever i * 0.05 may not be
+
+
+class Section(NamedTuple):
+    """A stretch of the tile along x that one family fills, in m.
+
+    The family's features lie in [begin, end]. Families that act on every sample rise from h = 0 at
+    `low` and are back at h = 0 at `high`: around the zone that adds the transition bands.
+    """
+
+    low: float
+    begin: float
+    end: float
+    high: float
+
+
+_MIDDLE = sum(ZONE) / 2
+WHOLE_ZONE = Section(START_END, *ZONE, GOAL_BEGIN)
+# Mixed: half a zone each, both level with the platforms where they meet.
+HALF_ZONES = (
+    Section(START_END, ZONE[0], _MIDDLE, _MIDDLE),
+    Section(_MIDDLE, _MIDDLE, ZONE[1], GOAL_BEGIN),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """What a tile is made of, in its frame and from the start to the goal.
+
+    Attributes
+    ----------
+    trenches : (k, 2) float64, m
+        x of both lips of each trench, where its walls meet the ground.
+    risers : (k, 2) float64, m
+        x of the middle of each riser, and how far the ground rises there (down is negative).
+    pillars : (k, 3) float64, m
+        x, y of the axis and diameter of each cylinder.
+    slope : float, rad
+        Lateral slope: positive where the ground rises to the left.
+    """
+
+    trenches: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    risers: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    pillars: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    slope: float = 0.0
+
+    def __add__(self, other: Features) -> Features:
+        """Those of two stretches of one tile; slopes do not add up, a tile has one at most."""
+        return Features(
+            np.vstack([self.trenches, other.trenches]),
+            np.vstack([self.risers, other.risers]),
+            np.vstack([self.pillars, other.pillars]),
+            self.slope or other.slope,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """One terrain tile in its own frame: sample [0, 0] at (0, 0).
+
+    Attributes
+    ----------
+    heights : (161, 161) float32, m
+        The collision surface h(x, y).
+    support : (161, 161) float32, m
+        The surface that the fall rule measures from: `heights` with trenches filled and pillars
+        taken away.
+    start : (3,) float64
+        x, y in m and yaw in rad.
+    goal : (2,) float64
+        x, y in m.
+    family : str
+    difficulty : float
+    parts : tuple of str
+        The families met along x: `(family,)`, or the two halves of Mixed.
+    features : Features
+        Its trenches, risers, pillars and slope.
+    cell : float, m
+    """
+
+    heights: HeightArray
+    support: HeightArray
+    start: FloatArray
+    goal: FloatArray
+    family: str
+    difficulty: float
+    parts: tuple[str, ...]
+    features: Features = field(default_factory=Features)
+    cell: float = CELL
+
+
+def difficulty_parameter(family: str, difficulty: float) -> float:
+    """Geometric parameter p(d) = p_min + d (p_max - p_min) of a family (Eq. 1).
+
+    Mixed has none of its own: each of its halves uses its family's.
+    """
+    if family not in FAMILIES:
+        raise ValueError(f"{family!r} has no parameter; choose from {', '.join(FAMILIES)}")
+    _check_difficulty(difficulty)
+    p_min, p_max = PARAMETER_RANGES[family]
+    return p_min + difficulty * (p_max - p_min)
+
+
+def draw_start_goal(
+    rng: np.random.Generator, shape: tuple[int, ...] = ()
+) -> tuple[FloatArray, FloatArray]:
+    """Draw starts (*shape, 3) as x, y, yaw and goals (*shape, 2) as x, y in a tile's frame."""
+    start, goal = np.empty((*shape, 3)), np.empty((*shape, 2))
+    start[..., 0], goal[..., 0] = START_X, GOAL_X
+    start[..., 1] = TILE_SIZE / 2 + rng.uniform(-Y_SPREAD, Y_SPREAD, shape)
+    start[..., 2] = rng.uniform(-YAW_SPREAD, YAW_SPREAD, shape)
+    goal[..., 1] = TILE_SIZE / 2 + rng.uniform(-Y_SPREAD, Y_SPREAD, shape)
+    return start, goal
+
+
+def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
+    """Generate one tile.
+
+    Parameters
+    ----------
+    family : str
+        One of `ALL_FAMILIES`, or the path of a height map, whose heights are multiplied by d.
+    difficulty : float
+        d in [0, 1.2]: level / 10; the curriculum ends at 1.
+    rng : numpy Generator
+        The only source of chance: the same state gives the same tile.
+    """
+    check_family(family)
+    _check_difficulty(difficulty)
+    start, goal = draw_start_goal(rng)
+    parts: tuple[str, ...] = (family,)
+    sections: tuple[Section, ...] = (WHOLE_ZONE,)
+    if family == "mixed":
+        first, second = rng.choice(len(FAMILIES), size=2, replace=False)
+        parts, sections = (FAMILIES[first], FAMILIES[second]), HALF_ZONES
+
+    heights = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
+    support = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
+    features = Features()
+    for part, section in zip(parts, sections, strict=True):
+        if is_map(part):
+            relief = difficulty * _blend(section, BAND)[:, None] * height_map(part)
+        else:
+            parameter = difficulty_parameter(part, difficulty)
+            relief, found = _SURFACES[part](section, parameter, rng)
+            features += found
+        heights += relief
+        if part not in _ON_FLAT_BASE:
+            support += relief
+    return Tile(
+        heights.astype(np.float32),
+        support.astype(np.float32),
+        start,
+        goal,
+        family,
+        float(difficulty),
+        parts,
+        features,
+    )
+
+
+# One function per family: (section, p(d), rng) -> relief in m, broadcastable to (161, 161) and
+# zero outside the section, so that sections add up to a tile; and what the relief consists of.
+Relief = tuple[FloatArray, Features]
+
+
+def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relief:
+    """h = A n(x, y): bilinear uniform noise, zero-mean, max |n| = 1 where fully blended in."""
+    lattice = LATTICES[rng.integers(len(LATTICES))]
+    nodes = math.ceil(TILE_SIZE / lattice) + 1
+    # Hat functions of the lattice at every sample: hat @ nodes @ hat.T interpolates bilinearly.
+    hat = np.maximum(0.0, 1.0 - np.abs(_X[:, None] / lattice - np.arange(nodes)))
+    noise = hat @ rng.uniform(-1.0, 1.0, (nodes, nodes)) @ hat.T
+    blend = _blend(section, BAND)
+    core = blend == 1.0
+    noise -= noise[core].mean()
+    noise /= np.abs(noise[core]).max()
+    # Higher peaks are possible where the noise is still blended in.
+    return amplitude * blend[:, None] * np.clip(noise, -1.0, 1.0), Features()
+
+
+def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
+    """Cylinders on a flat base; a section gets its share of the whole zone's `count`.
+
+    A sample within a cylinder's radius is raised, so a wall leans outwards over one cell.
+    """
+    pillars = place_pillars(section, round(count * _share(section)), rng)
+    relief = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
+    for cx, cy, d in pillars:
+        relief[(_X[:, None] - cx) ** 2 + (_X - cy) ** 2 <= (d / 2) ** 2] = PILLAR_HEIGHT
+    return relief, Features(pillars=pillars)
+
+
+def stair(section: Section, step_height: float, rng: np.random.Generator) -> Relief:
+    """As many steps up and as many down again as the section holds, a landing between.
+
+    A riser climbs over a single cell, the steepest a grid can be, and the tread behind it is drawn
+    from `TREAD_CELLS`, its riser's cell included. What room is left is shared at random between
+    the ground before the first riser, the landing and the ground behind the last.
+    """
+    cells = _sample(section.end) - _sample(section.begin)
+    low, high = TREAD_CELLS
+    up, down = rng.integers(low, high + 1, (2, cells // low))  # more than can fit
+    # n risers have n - 1 treads between them, and the last one a cell of its own.
+    length = 2 + np.cumsum(np.concatenate([[0], up + down])) + LANDING_CELLS
+    steps = int(np.searchsorted(length, cells, side="right"))
+    spare = cells - length[steps - 1]
+    before, behind = np.sort(rng.integers(0, spare + 1, 2))
+    first = _sample(section.begin) + before + np.concatenate([[0], np.cumsum(up[: steps - 1])])
+    last = _sample(section.end) - (spare - behind) - 1
+    back = last - np.concatenate([[0], np.cumsum(down[: steps - 1])])
+    rise = np.zeros(TILE_SAMPLES)
+    rise[first + 1], rise[back + 1] = step_height, -step_height
+    middle = (np.concatenate([first, back[::-1]]) + 0.5) * CELL
+    risers = np.column_stack([middle, np.repeat([step_height, -step_height], steps)])
+    # Counted in steps, so that the ground behind the stair is level to the last digit.
+    return step_height * np.cumsum(np.sign(rise))[:, None], Features(risers=risers)
+
+
+def gap(section: Section, width: float, rng: np.random.Generator) -> Relief:
+    """Trenches across the whole tile, at random but `TRENCH_SPACING` apart.
+
+    Each lowers floor or ceil of w / cell samples, at random so that the mean width is w. As the
+    walls lean over one cell on either side, a trench of n samples measures n - 1, n and n + 1 cells
+    at its bottom, at half its depth and at its top.
+    """
+    share = _share(section)
+    count = round(share * rng.integers(TRENCHES[0], TRENCHES[1] + 1))
+    cells = round(width / CELL, 6)
+    lowered = math.floor(cells) + (rng.uniform(size=count) < cells % 1.0)
+    # Snapping to the grid moves centres by less than a cell to the right, so one is kept in hand.
+    spacing = TRENCH_SPACING + CELL
+    room = section.end - section.begin - 2.0 * TRENCH_MARGIN - CELL - (count - 1) * spacing
+    free = np.sort(rng.uniform(0.0, room, count))
+    centres = section.begin + TRENCH_MARGIN + free + spacing * np.arange(count)
+    first = np.ceil(centres / CELL - 0.5 * (lowered - 1)).astype(int)
+    relief = np.zeros(TILE_SAMPLES)
+    for sample, n in zip(first, lowered, strict=True):
+        relief[sample : sample + n] = -TRENCH_DEPTH
+    trenches = CELL * np.column_stack([first - 1, first + lowered])
+    return relief[:, None], Features(trenches=trenches)
+
+
+def tilt(section: Section, angle: float, rng: np.random.Generator) -> Relief:
+    """h = +-(y - W/2) tan(theta), either side as likely, blended in and out."""
+    slope = float(rng.choice([-1.0, 1.0])) * angle
+    relief = _blend(section, TILT_BAND)[:, None] * (_X - TILE_SIZE / 2) * math.tan(slope)
+    return relief, Features(slope=slope)
+
+
+def _share(section: Section) -> float:
+    """The section's length over that of a whole zone."""
+    return (section.end - section.begin) / (ZONE[1] - ZONE[0])
+
+
+def is_map(family: str) -> bool:
+    """Whether a family is a file with heights of the user's own."""
+    return family.endswith(MAP_ENDING)
+
+
+@functools.lru_cache
+def height_map(path: str) -> FloatArray:
+    """Heights (161, 161) in m of a file, those of the zone at difficulty 1; the platforms are flat.
+
+    Raises:
+        ValueError: no such file, or one that holds something else.
+    """
+    try:
+        heights = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"terrain '{path}' cannot be read as a NumPy file: {error}") from error
+    shape = (TILE_SAMPLES, TILE_SAMPLES)
+    real = isinstance(heights, np.ndarray) and heights.dtype.kind in "fiu"
+    if not real or heights.shape != shape or not np.isfinite(heights).all():
+        raise ValueError(f"terrain '{path}' must hold finite heights in m, an array {shape}")
+    limit = HEIGHT_RANGE[1] / MAX_DIFFICULTY
+    if np.abs(heights).max() > limit:
+        raise ValueError(f"terrain '{path}' must stay within {limit:g} m of the platforms' height")
+    return heights.astype(np.float64)
+
+
+def family_number(family: str) -> int:
+    """A number of each family's own, below 2**32: part of the seeds of its tiles."""
+    if is_map(family):
+        return zlib.crc32(height_map(family).tobytes()) | 2**31  # above those of ALL_FAMILIES
+    return ALL_FAMILIES.index(family)
+
+
+def file_label(family: str) -> str:
+    """A family's name as a part of a file's name."""
+    return re.sub(r"[^\w.-]", "-", family)
+
+
+def place_pillars(section: Section, count: int, rng: np.random.Generator) -> FloatArray:
+    """Centres and diameters (count, 3) in m of cylinders that keep their clearance.
+
+    One after the other at random among free places. If one finds none, all are drawn anew: even
+    the 28 of level 12 take up no more than 40 % of the room, where random placing jams near 55 %.
+    """
+    restarts, candidates = 100, 256  # ample: at level 12 one tile in 25 restarts, easier ones fewer
+    for _ in range(restarts):
+        placed = np.empty((0, 3))
+        for d in rng.uniform(*PILLAR_DIAMETER, count):
+            x = rng.uniform(section.begin + d / 2, section.end - d / 2, candidates)
+            y = rng.uniform(d / 2, TILE_SIZE - d / 2, candidates)
+            distance = np.hypot(x[:, None] - placed[:, 0], y[:, None] - placed[:, 1])
+            free = (distance >= (d + placed[:, 2]) / 2 + PILLAR_CLEARANCE).all(axis=1)
+            if not free.any():
+                break
+            pick = free.argmax()
+            placed = np.vstack([placed, (x[pick], y[pick], d)])
+        else:
+            return placed
+    raise RuntimeError(f"no room for {count} pillars between x = {section.begin} and {section.end}")
+
+
+_SURFACES: dict[str, Callable[[Section, float, np.random.Generator], Relief]] = {
+    "rough": rough,
+    "pillar": pillar,
+    "stair": stair,
+    "gap": gap,
+    "tilt": tilt,
+}
+# Their relief is not ground: the fall rule measures from the flat base (TDGC-Bench, "Episode").
+_ON_FLAT_BASE = ("pillar", "gap")
+
+
+def tile_rng(
+    seed: int, family: str, level: int, index: int, stream: int = TRAIN_STREAM
+) -> np.random.Generator:
+    """Generator of tile number `index` of a family and level; streams and tiles never share one."""
+    check_family(family)
+    entropy = (stream, int(seed), family_number(family), int(level), int(index))
+    # Numbers of more than 32 bits would take two words and could then run into their neighbours.
+    if not all(0 <= number < 2**32 for number in entropy):
+        raise ValueError(f"stream, seed, level and index must lie in [0, 2**32), got {entropy}")
+    return np.random.default_rng(np.random.SeedSequence(entropy))
+
+
+class TileField:
+    """Tiles side by side in one height field, (rows, cols) of them, rows along x.
+
+    Tiles share no samples, so they repeat every 8.05 m. The world frame has sample [0, 0] at
+    (0, 0); a tile's frame is the world's less `origin`.
+
+    Attributes
+    ----------
+    shape : (rows, cols)
+    crop : float, m
+        Left out of each tile at both of its sides in y: a narrower field for training, where
+        Bullet's 600 bytes a sample are what fills memory.
+    heights, support : (161 rows, n cols) float32, m
+        See `Tile`; n is 161 less the crop. `place` overwrites them in place.
+    starts, goals : (rows, cols, 3) and (rows, cols, 2)
+        Each tile's own start (x, y, yaw) and goal (x, y), in the tile's frame.
+    features : dict of (row, col) -> Features
+        Of the tiles placed so far, each in its tile's frame.
+    """
+
+    def __init__(self, shape: tuple[int, int], crop: float = 0.0) -> None:
+        if not 0.0 <= crop < TILE_SIZE / 2 - Y_SPREAD:
+            raise ValueError(f"crop must lie in [0, {TILE_SIZE / 2 - Y_SPREAD}) m, got {crop}")
+        self.shape = shape
+        self.cell = CELL
+        self._cut = round(crop / CELL)
+        self._width = TILE_SAMPLES - 2 * self._cut
+        self.crop = self._cut * CELL
+        rows, cols = shape
+        self.heights: HeightArray = np.zeros((rows * TILE_SAMPLES, cols * self._width), np.float32)
+        self.support: HeightArray = np.zeros_like(self.heights)
+        self.starts, self.goals = np.zeros((rows, cols, 3)), np.zeros((rows, cols, 2))
+        self.features: dict[tuple[int, int], Features] = {}
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """World coordinates (x, y) in m of the last sample; the first lies at (0, 0)."""
+        nx, ny = self.heights.shape
+        return (nx - 1) * self.cell, (ny - 1) * self.cell
+
+    def place(self, row: int, col: int, tile: Tile) -> None:
+        """Copy one tile into the field, in place."""
+        n, m, cut = TILE_SAMPLES, self._width, self._cut
+        where = np.s_[row * n : (row + 1) * n, col * m : (col + 1) * m]
+        self.heights[where] = tile.heights[:, cut : cut + m]
+        self.support[where] = tile.support[:, cut : cut + m]
+        self.starts[row, col], self.goals[row, col] = tile.start, tile.goal
+        self.features[row, col] = tile.features
+
+    def origin(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
+        """World xy (..., 2) in m of the origin of the frames of the tiles at (row, col)."""
+        index = np.stack(np.broadcast_arrays(row, col), axis=-1)
+        pitch = np.array([TILE_SAMPLES, self._width]) * self.cell
+        return np.asarray(index * pitch - np.array([0.0, self.crop]))
+
+    def on_tile(
+        self, row: ArrayLike, col: ArrayLike, x: ArrayLike, y: ArrayLike
+    ) -> NDArray[np.bool_]:
+        """Whether world points lie on the tiles at (row, col), less the crop; all broadcast."""
+        local = np.stack(np.broadcast_arrays(x, y), axis=-1) - self.origin(row, col)
+        low = np.array([0.0, self.crop])
+        return np.asarray(((local >= low) & (local <= TILE_SIZE - low)).all(axis=-1))
+
+    def height_at(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Height in m of the collision surface at world points, clamped to the field's border."""
+        return interpolate(self.heights, self.cell, x, y)
+
+    def support_at(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """As `height_at`, for the support surface of the fall rule."""
+        return interpolate(self.support, self.cell, x, y)
+
+
+class TerrainGrid(TileField):
+    """The paper's grid of tiles in one height field: a row a level, a column a family.
+
+    Attributes
+    ----------
+    levels : (rows,) ints in [0, 12]; the same level may have several rows
+    families : (cols,) names from `ALL_FAMILIES`
+    seed, stream : int
+        See `tile_rng`.
+    """
+
+    def __init__(
+        self,
+        levels: Sequence[int],
+        families: Sequence[str],
+        seed: int,
+        stream: int = TRAIN_STREAM,
+    ) -> None:
+        self.levels, self.families = tuple(levels), tuple(families)
+        self.seed, self.stream = seed, stream
+        for family in self.families:
+            check_family(family)
+        if not all(level in range(OOD_LEVELS[-1] + 1) for level in self.levels):
+            raise ValueError(
+                f"levels must be whole numbers from 0 to {OOD_LEVELS[-1]}, got {self.levels}"
+            )
+        samples = len(self.levels) * len(self.families) * TILE_SAMPLES**2
+        if not 0 < samples <= MAX_SAMPLES:
+            raise ValueError(
+                f"a grid needs 1 to {MAX_SAMPLES // TILE_SAMPLES**2} tiles (Bullet holds "
+                f"{MAX_SAMPLES} samples), got {len(self.levels)} x {len(self.families)}"
+            )
+        super().__init__((len(self.levels), len(self.families)))
+
+    @classmethod
+    def build(
+        cls,
+        levels: Sequence[int],
+        families: Sequence[str],
+        seed: int,
+        stream: int = TRAIN_STREAM,
+        index: ArrayLike = 0,
+    ) -> TerrainGrid:
+        """Make a grid and draw its tiles; `index` as in `redraw`."""
+        grid = cls(levels, families, seed, stream)
+        grid.redraw(index)
+        return grid
+
+    def redraw(self, index: ArrayLike) -> None:
+        """Replace every tile, in place, by number `index` of its kind (see `tile_rng`).
+
+        `index` is one number for all tiles or an array that broadcasts to (rows, cols), which
+        tells rows of the same level, or columns of the same family, apart.
+        """
+        indices = np.broadcast_to(np.asarray(index), self.shape)
+        for row, level in enumerate(self.levels):
+            for col, family in enumerate(self.families):
+                rng = tile_rng(self.seed, family, level, indices[row, col], self.stream)
+                self.place(row, col, make_tile(family, level / MAX_LEVEL, rng))
+
+
+def interpolate(surface: HeightArray, cell: float, x: ArrayLike, y: ArrayLike) -> FloatArray:
+    """Height in m at points (x, y) of any shape, exactly as Bullet's triangles have it.
+
+    Bullet splits each cell along the diagonal from [ix + 1, iy] to [ix, iy + 1] (its default,
+    measured with rays and with contacts). Both ends of the diagonal weigh in everywhere; the third
+    corner is [ix, iy] on one side of it and [ix + 1, iy + 1] on the other. Points outside take the
+    nearest border's height.
+    """
+    nx, ny = surface.shape
+    flat = surface.reshape(-1)
+    u = np.clip(np.asarray(x) / cell, 0.0, nx - 1)
+    v = np.clip(np.asarray(y) / cell, 0.0, ny - 1)
+    ix = np.minimum(u.astype(np.intp), nx - 2)
+    iy = np.minimum(v.astype(np.intp), ny - 2)
+    u, v = u - ix, v - iy
+    corner = ix * ny + iy
+    past = u + v - 1.0  # positive past the diagonal
+    third = flat[corner + (past > 0.0) * (ny + 1)]
+    heights: FloatArray = (
+        np.abs(past) * third
+        + np.minimum(u, 1.0 - v) * flat[corner + ny]
+        + np.minimum(v, 1.0 - u) * flat[corner + 1]
+    )
+    return heights
+
+
+def _blend(section: Section, band: float) -> FloatArray:
+    """Weights (161,) along x: 0 outside the section, 1 inside, linear over `band` at its ends."""
+    return np.clip(np.minimum(_X - section.low, section.high - _X) / band, 0.0, 1.0)
+
+
+def _sample(x: float) -> int:
+    """Index of the sample at x."""
+    return round(x / CELL)
+
+
+def check_family(family: str, beside: Sequence[str] = ()) -> None:
+    """See that a tile of the family can be made; those ``beside`` are allowed, too.
+
+    Raises:
+        ValueError: an unknown name, or a height map that cannot be used.
+    """
+    if is_map(family):
+        height_map(family)
+    elif family not in (*ALL_FAMILIES, *beside):
+        allowed = ", ".join((*beside, *ALL_FAMILIES, f"FILE{MAP_ENDING}"))
+        raise ValueError(f"unknown terrain family {family!r}; choose from {allowed}")
+
+
+def _check_difficulty(difficulty: float) -> None:
+    if not 0.0 <= difficulty <= MAX_DIFFICULTY:  # also false for nan
+        raise ValueError(f"difficulty must lie in [0, {MAX_DIFFICULTY}], got {difficulty}")

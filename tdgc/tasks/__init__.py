@@ -1,0 +1,1 @@
+"""The two MDPs, their rewards, curricula and the scripted teacher."""

@@ -1,0 +1,547 @@
+"""The decision-level MDP (paper Sec. IV-B, IV-C) around a frozen low-level policy.
+
+``NavigationTask`` is the MDP for M robots at once, each on a tile of its own whose level the
+curriculum sets; ``NavigationEnv`` is its Gymnasium face for one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc import policies
+from tdgc.config import (
+    ConfigError,
+    HighLevelConfig,
+    HighRewardConfig,
+    LowLevelConfig,
+    recorded,
+)
+from tdgc.policies import Policy
+from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, gait_index
+from tdgc.sim.gaits import GAITS
+from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
+from tdgc.sim.robot import NUM_JOINTS, Array, wrap_angle
+from tdgc.sim.terrain import FAMILIES, draw_start_goal
+from tdgc.sim.world import World
+from tdgc.state import State, copies, fill
+from tdgc.tasks import rewards
+from tdgc.tasks.curriculum import Curriculum
+from tdgc.tasks.leaps import Landing
+from tdgc.tasks.low_env import GOAL_RADIUS, TaskEnv, is_fallen
+from tdgc.tasks.teacher import Teacher
+from tdgc.tasks.tiles import TrainingTiles
+
+#: Where the shipped policies are.
+PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
+
+GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
+PROBE_RANGE = 0.5  # m, deeper and higher looks the same
+
+#: The sparse geometric cue: 32 heights in the heading frame, from a hind foot to three strides
+#: ahead, staggered over four lines: an edge across the way is found to 5 cm, and a pillar on it,
+#: 20 cm wide at least, meets a probe.
+PROBES: Array = np.array([(0.05 * i - 0.25, (0.1, -0.3, 0.3, -0.1)[i % 4]) for i in range(32)])
+_GUIDANCE = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
+
+#: The semantic cue: one-hot over the families, and one place for "unknown".
+SEMANTIC = (*FAMILIES, "unknown")
+
+
+def high_layout(cues: str) -> tuple[tuple[str, int], ...]:
+    """Names and sizes of the parts of the high level's observation o^H, in order."""
+    layout = [
+        ("goal", 3),
+        ("time_left", 1),
+        ("gravity", 3),
+        ("joint_error", NUM_JOINTS),
+        ("joint_speed", NUM_JOINTS),
+        ("last_action", NUM_ACTIONS),
+        ("clock", 4),
+    ]
+    if cues in ("both", "semantic"):
+        layout.append(("family", len(SEMANTIC)))
+    if cues in ("both", "geometric"):
+        layout.append(("probes", len(PROBES)))
+    return tuple(layout)
+
+
+def height_probes(loco: Locomotion) -> Array:
+    """Ground under ``PROBES`` against where a standing robot's ground would be, (M, 32) m."""
+    state = loco.world.state
+    c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
+    x = state.position[:, :1] + c * PROBES[:, 0] - s * PROBES[:, 1]
+    y = state.position[:, 1:2] + s * PROBES[:, 0] + c * PROBES[:, 1]
+    standing = state.position[:, 2:3] - loco.robot.base_height
+    return np.clip(loco.world.ground_height(x, y) - standing, -PROBE_RANGE, PROBE_RANGE)
+
+
+def observe_high(
+    loco: Locomotion,
+    goal: Array,
+    time_share: Array,
+    last_action: Array,
+    families: NDArray[np.int64],
+    cues: str,
+) -> NDArray[np.float32]:
+    """o^H of M robots, (M, sum of ``high_layout``).
+
+    Args:
+        loco: the robots.
+        goal: (M, 2) m in the world.
+        time_share: (M,) t / T_max.
+        last_action: (M, 13), normalised.
+        families: (M,) index into ``SEMANTIC``.
+        cues: both, semantic, geometric or none.
+    """
+    state = loco.world.state
+    offset = goal - state.position[:, :2]
+    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
+    distance = np.linalg.norm(offset, axis=1)
+    parts = [
+        np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1),
+        1.0 - time_share[:, None],
+        state.gravity,
+        state.q - loco.joint_offset - loco.nominal,
+        SPEED_SCALE * state.qd,
+        last_action,
+        loco.clock.signal(),
+    ]
+    if cues in ("both", "semantic"):
+        parts.append(np.eye(len(SEMANTIC))[families])
+    if cues in ("both", "geometric"):
+        parts.append(height_probes(loco) / PROBE_RANGE)
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def command_share(commands: Array, decoder: CommandDecoder) -> Array:
+    """Commands (..., 15) as shares of the decoder's ranges, so that differences have one scale."""
+    span = np.where(decoder.high > decoder.low, decoder.high - decoder.low, 1)
+    return np.asarray((commands - decoder.low) / span)
+
+
+def high_step(
+    loco: Locomotion,
+    goal: Array,
+    time_share: Array | float,
+    actions: Array,
+    shares: Array,
+    force: Array,
+    config: HighRewardConfig,
+) -> rewards.HighStep:
+    """What the reward terms look at, after a decision was carried out.
+
+    Args:
+        loco: the robots.
+        goal: (M, 2) m in the world.
+        time_share: (M,) or one for all, t / T_max.
+        actions: (2, M, 13) of this decision and the one before, normalised.
+        shares: (3, M, 15) ``command_share`` of this decision and the two before.
+        force: (M, 5) N, largest since the decision: the trunk, and each leg above the foot.
+        config: weights and constants.
+    """
+    state = loco.world.state
+    offset = goal - state.position[:, :2]
+    x, y = state.position[:, 0], state.position[:, 1]
+    return rewards.HighStep(
+        distance=np.linalg.norm(offset, axis=1),
+        heading_error=np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw,
+        time_share=np.broadcast_to(time_share, x.shape),
+        lin_vel=state.lin_vel,
+        ang_vel=state.ang_vel,
+        joint_speed=state.qd,
+        base_height=state.position[:, 2] - loco.world.support_height(x, y),
+        standing_height=loco.robot.base_height,
+        actions=actions,
+        commands=shares,
+        contact_forces=force,
+        config=config,
+    )
+
+
+def check_pair(high: HighLevelConfig, low: LowLevelConfig) -> None:
+    """Refuse decoder bounds that the low level was not trained on.
+
+    Raises:
+        ConfigError: names the command and both ranges.
+    """
+    for f in dataclasses.fields(low.commands):
+        asked, trained = getattr(high.commands, f.name), getattr(low.commands, f.name)
+        if asked[0] < trained[0] or asked[1] > trained[1]:
+            raise ConfigError(
+                f"commands.{f.name} asks for {list(asked)}, but the low level was trained on "
+                f"{list(trained)}"
+            )
+
+
+def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
+    """A low-level policy, given itself or by its path, and the MDP it was trained on.
+
+    Raises:
+        ValueError: a file that cannot be used, or a policy that is no low level.
+    """
+    name, low = low, low if isinstance(low, Policy) else policies.load(low)
+    if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
+        raise ConfigError(f"{name}: not a low-level policy of this package")
+    return low, recorded(LowLevelConfig, low.meta["config"], name)
+
+
+class NavigationTask:
+    """The high-level MDP of M robots.
+
+    An action is (M, 13) in [-a_max, a_max]; it is decoded and held for ``decimation`` control
+    steps of the frozen low level. An episode fails when the trunk is low, hits something hard, or
+    the robot leaves its tile; it is truncated after 20 s, or 2 s after the goal was reached.
+
+    Args:
+        config: the MDP's configuration.
+        low: the low-level policy, or its path; a task that is made on another machine needs the
+            policy itself.
+        num_robots: M.
+        seed: of everything random here.
+        training: draw disturbances and let the curriculum move levels.
+        visual: keep what pictures of the ground need.
+        guided: decisions of each robot in which a teacher helps, see ``tdgc.learn.imitation``. Its
+            actions follow the observation, and it drives a share of the episodes that falls from
+            all to none over the first ``_GUIDANCE`` of these decisions.
+        landing: of the low level, for the teacher.
+    """
+
+    def __init__(
+        self,
+        config: HighLevelConfig,
+        low: str | Path | Policy,
+        num_robots: int,
+        seed: int,
+        training: bool = True,
+        visual: bool = False,
+        guided: int = 0,
+        landing: Landing | None = None,
+    ) -> None:
+        self.config, self._visual = config, visual
+        self.num_robots = m = num_robots
+        self.training = training
+        self.low, self.low_config = load_low(low)
+        check_pair(config, self.low_config)
+        self.decoder = CommandDecoder(config.commands, config.action_limit)
+        self.rng = np.random.default_rng(seed)
+        self.step_seconds = config.decimation * self.low_config.physics.control_dt
+        self.horizon = round(config.episode_seconds / self.step_seconds)
+        self._hold = round(config.hold_seconds / self.step_seconds)
+        self.family = np.arange(m) % len(config.families)
+        first = np.arange(m) // len(config.families) % config.first_levels
+        self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, first)
+        self.tiles = TrainingTiles([config.families[f] for f in self.family], seed)
+        self.field = self.tiles.field
+        self.locomotion = self._build_locomotion()
+        self._origin = self.field.origin(np.arange(m), 0)
+        self.goal = np.zeros((m, 2))
+        self.elapsed = np.zeros(m, dtype=np.int64)
+        self._reached_at = np.full(m, -1)
+        self._next_push = np.zeros(m)
+        self._actions = np.zeros((2, m, NUM_ACTIONS))
+        self._commands = np.zeros((3, m, 15))
+        self.stats: dict[str, float] = {}
+        families = [config.families[f] for f in self.family]
+        self.teacher = Teacher(self.field, families, landing) if guided else None
+        self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
+        self._led = np.zeros(m, dtype=bool)
+        self._taught = np.zeros((m, NUM_ACTIONS))
+        size = sum(width for _, width in high_layout(config.cues))
+        self.actor_dim = size
+        if guided:
+            size += NUM_ACTIONS
+        limit = config.action_limit
+        self.action_space = gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    def _build_locomotion(self) -> Locomotion:
+        self.tiles.draw(np.arange(self.num_robots), self.curriculum.levels)
+        c = self.low_config
+        return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro, self._visual)
+
+    # ------------------------------------------------------------------ episodes
+
+    def reset(self, index: NDArray[np.integer]) -> None:
+        """Start new episodes for the robots ``index`` (n,)."""
+        n, rng = len(index), self.rng
+        changed = self.tiles.begin(index, self.curriculum.levels)
+        if changed.size:
+            self.locomotion.world.upload_terrain(changed)
+        starts, goals = draw_start_goal(rng, (n,))
+        self.goal[index] = goals + self._origin[index]
+        self.elapsed[index] = 0
+        self._reached_at[index] = -1
+        if self.training:
+            width = self._width()[index]
+            self.locomotion.randomise(index, self.config.randomisation, rng, width)
+            self._schedule_push(index)
+        self._actions[:, index] = 0.0
+        middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
+        self._commands[:, index] = command_share(middle, self.decoder)
+        self.locomotion.place(
+            index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
+        )
+        if self.teacher is not None:
+            self.teacher.begin(index, self.goal)
+            share = 1.0 - self._decisions[0] / (_GUIDANCE * self._guided)
+            self._led[index] = rng.uniform(size=n) < share
+
+    def _width(self) -> Array:
+        """How wide each robot's disturbances are: they grow with its level."""
+        return self.curriculum.levels / max(self.config.levels - 1, 1)
+
+    def restart(self) -> None:
+        """End every episode, draw new tiles and build the world anew (see ``LowLevelTask``)."""
+        self.locomotion.world.close()
+        self.locomotion = self._build_locomotion()
+        self.reset(np.arange(self.num_robots))
+
+    def step(
+        self, actions: NDArray[np.floating]
+    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+        """One decision: (M, 13) -> reward, terminated, truncated, (M,) each.
+
+        The order is the paper's: physics and low level, terminations and reaching, reward; the
+        caller resets afterwards.
+
+        Raises:
+            ValueError: a value that is not finite.
+        """
+        loco, c = self.locomotion, self.config
+        actions = np.where(self._led[:, None], self._taught, actions)
+        self._decisions += 1
+        self._actions = np.stack([self.decoder.normalise(actions), self._actions[0]])
+        commands = self.decoder.decode(actions)
+        share = command_share(commands, self.decoder)
+        self._commands = np.concatenate([share[None], self._commands[:-1]])
+        loco.command[:] = commands
+        failed = np.zeros(self.num_robots, dtype=bool)
+        force = np.zeros((self.num_robots, 5))
+        reached = self._reached_at >= 0
+        for _ in range(c.decimation):
+            low_actions = self.low.predict(loco.observe(c.randomisation, self.rng))[0]
+            # A robot that has blown up sees no numbers, so it has no action either. Its decision is
+            # carried through all the same: who reads its observation then finds it out.
+            low_actions[~np.isfinite(low_actions).all(axis=1)] = 0.0
+            loco.act(low_actions)
+            failed |= self._failed(loco.world)
+            state = loco.world.state
+            now = np.column_stack([state.trunk_force, state.leg_force])
+            np.maximum(force, now, out=force)
+            distance = np.linalg.norm(self.goal - state.position[:, :2], axis=1)
+            reached |= (distance < GOAL_RADIUS) & ~failed
+        self.elapsed += 1
+        self._reached_at[reached & (self._reached_at < 0)] = self.elapsed[
+            reached & (self._reached_at < 0)
+        ]
+        seen = high_step(
+            loco,
+            self.goal,
+            self.elapsed / self.horizon,
+            self._actions,
+            self._commands,
+            force,
+            c.rewards,
+        )
+        terms = rewards.high_terms(seen, self.step_seconds)
+        reward = np.sum(list(terms.values()), axis=0)
+        held = reached & (self.elapsed - self._reached_at >= self._hold)
+        truncated = ~failed & (held | (self.elapsed >= self.horizon))
+        done = np.flatnonzero(failed | truncated)
+        self._count(terms, reward, commands, done, reached)
+        if self.training:
+            if done.size:
+                self.curriculum.push(done, reached[done])
+            self._push()
+        return reward, failed, truncated
+
+    def _failed(self, world: World) -> NDArray[np.bool_]:
+        x, y = world.state.position[:, 0], world.state.position[:, 1]
+        return is_fallen(world) | ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
+
+    def observe(self) -> NDArray[np.float32]:
+        """o^H, (M, actor_dim), and with a teacher its actions, (M, 13)."""
+        seen = observe_high(
+            self.locomotion,
+            self.goal,
+            self.elapsed / self.horizon,
+            self._actions[0],
+            self.family_index,
+            self.config.cues,
+        )
+        if self.teacher is None:
+            return seen
+        commands = self.teacher.commands(self.locomotion, self.goal)
+        self._taught = self.decoder.encode(commands)
+        return np.concatenate([seen, self._taught], axis=1, dtype=np.float32)
+
+    @property
+    def reached(self) -> NDArray[np.bool_]:
+        """Whether each robot has reached its goal in this episode, (M,)."""
+        return self._reached_at >= 0
+
+    @property
+    def family_index(self) -> NDArray[np.int64]:
+        """Index into ``SEMANTIC`` of the family that each robot is told, (M,)."""
+        names = [self.config.families[f] for f in self.family]
+        told = np.array([SEMANTIC.index(n) if n in SEMANTIC else len(FAMILIES) for n in names])
+        if self.training:  # the last robots of each family are not told
+            each = self.num_robots / len(self.config.families)
+            place = np.arange(self.num_robots) // len(self.config.families)
+            told[place >= each * (1.0 - self.config.unknown_share)] = len(FAMILIES)
+        return told
+
+    # ------------------------------------------------------------------ disturbances
+
+    def _schedule_push(self, index: NDArray[np.integer]) -> None:
+        wait = self.rng.uniform(*self.config.randomisation.push_interval, len(index))
+        self._next_push[index] = self.elapsed[index] + wait / self.step_seconds
+
+    def _push(self) -> None:
+        index = np.flatnonzero(self.elapsed >= self._next_push)
+        if not index.size:
+            return
+        r = self.config.randomisation
+        angle = self.rng.uniform(-np.pi, np.pi, index.size)
+        top = r.scale * r.push_speed * self._width()[index]
+        speed = top * self.rng.uniform(size=index.size)
+        velocity = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+        self.locomotion.world.push(index, speed[:, None] * velocity)
+        self._schedule_push(index)
+
+    # ------------------------------------------------------------------ statistics, resume
+
+    def _count(
+        self,
+        terms: dict[str, Array],
+        reward: Array,
+        commands: Array,
+        done: NDArray[np.integer],
+        reached: NDArray[np.bool_],
+    ) -> None:
+        stats = self.stats
+
+        def add(key: str, value: float) -> None:
+            stats[key] = stats.get(key, 0.0) + float(value)
+
+        add("steps", self.num_robots)
+        add("reward", reward.sum())
+        for name, value in terms.items():
+            add(f"term/{name}", value.sum())
+        gait = gait_index(commands)
+        for col, family in enumerate(self.config.families):
+            mine = self.family == col
+            ended = done[mine[done] & ~self._led[done]]
+            add(f"family/{family}/count", mine.sum())
+            add(f"family/{family}/level", self.curriculum.levels[mine].sum())
+            add(f"family/{family}/episodes", ended.size)
+            add(f"family/{family}/reached", reached[ended].sum())
+            for g, name in enumerate(GAITS):
+                add(f"family/{family}/{name}", (gait[mine] == g).sum())
+
+    def take_stats(self) -> dict[str, float]:
+        """The sums since the last call."""
+        stats, self.stats = self.stats, {}
+        stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
+        return stats
+
+    def forget(self) -> None:
+        """Let what follows depend on ``state_dict`` alone, see ``World.forget``."""
+        self.locomotion.world.forget()
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Of the episodes under way."""
+        return {
+            "goal": self.goal,
+            "elapsed": self.elapsed,
+            "reached_at": self._reached_at,
+            "next_push": self._next_push,
+            "actions": self._actions,
+            "commands": self._commands,
+            "led": self._led,
+            "taught": self._taught,
+        }
+
+    def state_dict(self) -> State:
+        """The curriculum and the robots' ``episodes`` under way, as copies."""
+        return {
+            "rng": self.rng.bit_generator.state,
+            "tiles_drawn": self.tiles.drawn,
+            "decisions": self._decisions.copy(),
+            "curriculum": self.curriculum.state_dict(),
+            "episodes": {
+                **copies(self._arrays()),
+                "locomotion": self.locomotion.state_dict(),
+                "tiles": self.tiles.state_dict(),
+            },
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on from a ``state_dict``, as a ``forget`` there would have gone on; from one without
+        ``episodes`` with new ones.
+
+        Raises:
+            ValueError: a state of other robots.
+        """
+        self.rng.bit_generator.state = state["rng"]
+        self.curriculum.load_state_dict(state["curriculum"])
+        self.tiles.drawn = int(state["tiles_drawn"])
+        self._decisions[:] = state["decisions"]
+        if "episodes" not in state:
+            self.restart()
+            return
+        episodes = state["episodes"]
+        fill(self._arrays(), episodes)
+        self.tiles.load_state_dict(episodes["tiles"])
+        self.locomotion.world.upload_terrain()
+        self.locomotion.load_state_dict(episodes["locomotion"])
+        if self.teacher is not None:
+            self.teacher.begin(np.arange(self.num_robots), self.goal)
+
+    def close(self) -> None:
+        """Disconnect from Bullet."""
+        self.locomotion.world.close()
+
+
+class NavigationEnv(TaskEnv):
+    """``NavigationTask`` for one robot, id ``tdgc/Navigation-v0``."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  as in gymnasium
+
+    def __init__(
+        self,
+        config: HighLevelConfig | None = None,
+        low: str | Path = PRETRAINED / "low",
+        render_mode: str | None = None,
+    ) -> None:
+        self.config = config or HighLevelConfig()
+        super().__init__(
+            lambda seed, visual: NavigationTask(self.config, low, 1, seed, visual=visual),
+            render_mode,
+        )
+
+
+def summarise(sums: dict[str, float]) -> dict[str, float]:
+    """Sums of ``NavigationTask.take_stats`` over all workers -> values to log."""
+    steps = max(sums.get("steps", 0.0), 1.0)
+    values = {"reward/total": sums.get("reward", 0.0) / steps}
+    for key, value in sums.items():
+        if key.startswith("term/"):
+            values[f"reward/{key[5:]}"] = value / steps
+    counts = [k for k in sums if k.startswith("family/") and k.endswith("/count")]
+    families = [k.removeprefix("family/").removesuffix("/count") for k in counts]
+    for family in families:
+        count = max(sums[f"family/{family}/count"], 1.0)
+        values[f"level/{family}"] = sums[f"family/{family}/level"] / count
+        episodes = sums[f"family/{family}/episodes"]
+        if episodes:
+            values[f"success/{family}"] = sums[f"family/{family}/reached"] / episodes
+        for gait in GAITS:
+            values[f"gait/{family}_{gait}"] = sums[f"family/{family}/{gait}"] / count
+    return values
