@@ -672,7 +672,8 @@ def _choose_formats(text: str) -> list[str]:
     for name in names:
         if name not in FORMATS:
             raise ValueError(f"unknown format '{name}'; allowed: {', '.join(FORMATS)}")
-    require(_PACKAGES if "onnx" in names else _PACKAGES[:1], "export")
+    onnx = "onnx" in names
+    require(f"format {text}", _PACKAGES if onnx else _PACKAGES[:1], "export")
     return names
 
 

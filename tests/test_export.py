@@ -16,7 +16,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from tdgc import export, policies
 from tdgc.config import CommandRanges, HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
-from tdgc.export import FORMATS, TOLERANCE, Graph, HighLevel, LowLevel
+from tdgc.deploy.controller import FORMATS, Graph
+from tdgc.export import TOLERANCE, HighLevel, LowLevel
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
 from tdgc.sim.commands import CommandDecoder
@@ -34,6 +35,7 @@ from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_layout, load_lo
 
 LOW = PRETRAINED / "low"
 LOW_POLICY, LOW_CONFIG = load_low(LOW)
+HIGH_CONFIG = HighLevelConfig(commands=LOW_CONFIG.commands)
 
 
 def unbounded(size: int) -> spaces.Box:
@@ -128,7 +130,7 @@ def run(level: LowLevel | HighLevel, values: dict[str, np.ndarray]) -> dict[str,
 @pytest.fixture(scope="module")
 def high(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("high") / "policy"
-    return random_high(path, HighLevelConfig())
+    return random_high(path, HIGH_CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +203,7 @@ def test_low_level_is_the_executors_step(
 
 @pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])
 def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: str) -> None:
-    narrow = dataclasses.replace(CommandRanges(), vx=(-0.5, 0.8), pitch=(0.0, 0.0))
+    narrow = dataclasses.replace(LOW_CONFIG.commands, vx=(-0.5, 0.8), pitch=(0.0, 0.0))
     config = HighLevelConfig(cues=cues, action_limit=2.0, decimation=4, commands=narrow)
     policy = policies.load(random_high(tmp_path / "high", config))
     level = HighLevel(policy, config, LOW_CONFIG)
@@ -249,7 +251,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: s
 
 def test_decoding_is_the_decoders_to_the_last_bit_of_a_gait(high: Path) -> None:
     pair = export.load_pair(LOW, high)
-    level, decoder = HighLevel(pair.high, pair.high_config, pair.low_config), CommandDecoder()
+    level, decoder = HighLevel(pair.high, pair.high_config, pair.low_config), CommandDecoder(HIGH_CONFIG.commands)
     rng = np.random.default_rng(3)
     actions = rng.uniform(-1.3, 1.3, (40, 13))
     edges = np.float32([-0.5, 0.0, 0.5])
@@ -296,7 +298,7 @@ def test_graphs_drive_a_robot_as_the_policies_do(folder: Path, high: Path, form:
 
 
 def test_check_finds_other_weights(tmp_path: Path) -> None:
-    short = HighLevelConfig(episode_seconds=1.0)
+    short = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
     other = random_high(tmp_path / "short", short)
     pair = export.load_pair(LOW, other)
     export.write(pair, tmp_path, ["torchscript"])
@@ -345,33 +347,59 @@ def test_interface_names_what_the_graph_has(folder: Path, name: str) -> None:
         assert {x.type for x in found} == {"tensor(double)"}
     names = {s["name"] for side in ("inputs", "outputs") for s in table[side]}
     for signal in table["inputs"] + table["outputs"]:
-        assert signal["meaning"] and signal.get("previous") in {None, *names}
-        assert ("previous" in signal) == ("start" in signal)
-        assert "unit" in signal or signal["order"] == "commands"
-        if "order" in signal:
+        assert signal["meaning"] and signal["previous"] in {None, *names}
+        handed_on = signal["previous"] is not None or signal["source"] == "low.next_clock"
+        assert handed_on == (signal["start"] is not None)
+        assert (signal["unit"] is None) == (signal["order"] == "commands")
+        if signal["order"] is not None:
             order = table[signal["order"]]
-            assert (
-                len(order.get("ahead_left") if isinstance(order, dict) else order)
-                == (signal["shape"][0])
-            )
+            order = order["ahead_left"]["value"] if isinstance(order, dict) else order
+            assert len(order) == signal["shape"][0]
 
 
 def test_interface_says_how_to_drive_the_joints(folder: Path) -> None:
     table = json.loads((folder / "low_interface.json").read_text())
-    assert table["rate_hz"] == 50.0 and table["joints"] == list(JOINTS)
-    control = table["joint_control"]
-    assert control["rate_hz"] == pytest.approx(400.0)
+    assert table["rate"] == {"unit": "Hz", "value": 50.0} and table["joints"] == list(JOINTS)
+    control, robot = table["joint_control"], LOW_CONFIG.robot
+    assert control["rate"]["value"] == LOW_CONFIG.physics.joint_steps * 50.0
     assert control["kp"] == {"unit": "N m/rad", "value": [20.0] * 12}
     assert control["kd"] == {"unit": "N m s/rad", "value": [0.6] * 12}
     assert control["torque_limit"] == {"unit": "N m", "value": [23.7, 23.7, 35.5] * 4}
-    assert control["nominal_pose"]["value"] == nominal_pose(LOW_CONFIG.robot).tolist()
+    assert control["speed_limit"] == {"unit": "rad/s", "value": [30.0, 30.0, 20.0] * 4}
+    assert control["simulated_speed_limit"] == {"unit": "rad/s", "value": [20.0] * 12}
+    assert control["joint_limits"]["low"][:3] == [-0.86, -0.69, -2.82]
+    assert control["joint_limits"]["high"][:3] == [0.86, 4.5, -0.89]
+    assert control["target_margin"] == {"unit": "rad", "value": robot.joint_margin}
+    assert table["start"]["joint_angles"]["value"] == nominal_pose(robot).tolist()
+    # 0.213 m each: thighs at 0.8 and 1 rad, calves at -0.7 and -0.5, and 22 mm of foot below
+    rear = 0.213 * (np.cos(1.0) + np.cos(0.5))
+    front = 0.213 * (np.cos(0.8) + np.cos(0.7))
+    hip = 0.08 * np.sin(0.1)
+    height = max(front, rear) * np.cos(0.1) - hip + 0.022
+    assert table["start"]["trunk_height"]["value"] == pytest.approx(height, abs=1e-9)
+    assert table["robot"]["urdf"]["file"] == "quadruped.urdf"
+    assert table["robot"]["total_mass"]["value"] == pytest.approx(12.6)
+    assert table["robot"]["link_masses"]["value"]["trunk"] == 5.6
     assert table["feet"] == ["FL", "FR", "RL", "RR"]
-    assert table["gaits"]["trot"] == {"phase": 0.5, "offset": 0.0, "bound": 0.0}
+    assert table["gaits"][0] == {"name": "trot", "phase": 0.5, "offset": 0.0, "bound": 0.0}
     assert table["commands"][4] == {"name": "frequency", "unit": "Hz", "low": 2.0, "high": 4.0}
+    assert table["commands"][13] == {"name": "offset", "unit": "1", "values": [0.0, 0.5]}
+
+
+def test_interface_says_how_to_decide(folder: Path) -> None:
     table = json.loads((folder / "high_interface.json").read_text())
-    assert table["rate_hz"] == pytest.approx(10.0) and table["control_steps"] == 5
+    assert table["rate"]["value"] == pytest.approx(10.0)
+    assert table["order"] == [{"graph": "high", "every": 5}, {"graph": "low", "every": 1}]
     assert table["policy"] == {"seed": 7}
     assert table["families"][-1] == "unknown" and table["decision"][-1] == "gait"
+    assert table["probes"]["plane_below_trunk"] == {"unit": "m", "value": 0.3}
+    clock = next(s for s in table["inputs"] if s["name"] == "clock")
+    assert (clock["source"], clock["start"]) == ("low.next_clock", 0.0)
+    task = table["task"]
+    assert task["goal_radius"] == {"unit": "m", "value": 0.5}
+    assert task["horizon"]["unit"] == "s" and task["horizon"]["value"] == pytest.approx(20.0)
+    assert task["after_goal"]["keep_deciding"]["value"] == pytest.approx(2.0)
+    assert task["family"]["otherwise"] == "unknown"
 
 
 ROBOT = """
@@ -403,13 +431,13 @@ def test_a_robot_needs_no_part_of_this_package(folder: Path) -> None:
 def test_command_writes_checks_and_reports(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    short = HighLevelConfig(episode_seconds=1.0)
+    short = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
     high = random_high(tmp_path / "high", short)
     out = tmp_path / "new" / "out"
     arguments = ["--high", str(high), "--out", str(out), "--format", "torchscript"]
     assert export.main(arguments) == 0
     assert sorted(path.name for path in out.iterdir()) == [
-        "high.pt", "high_interface.json", "low.pt", "low_interface.json"
+        "high.pt", "high_interface.json", "low.pt", "low_interface.json", "quadruped.urdf"
     ]  # fmt: skip
     said = capsys.readouterr()
     assert said.err == "" and said.out.count("\n") == 1
@@ -424,12 +452,12 @@ def test_command_writes_checks_and_reports(
 
 def save_pairs(path: Path) -> None:
     """High levels that do not fit the shipped low level, and one that does."""
-    fast = dataclasses.replace(CommandRanges(), vx=(-1.0, 1.5))
+    fast = dataclasses.replace(LOW_CONFIG.commands, vx=(-1.0, 1.5))
     physics = dataclasses.replace(LOW_CONFIG.physics, control_dt=0.01)
-    random_high(path / "high", HighLevelConfig(), hidden=4)
+    random_high(path / "high", HIGH_CONFIG, hidden=4)
     random_high(path / "fast", HighLevelConfig(commands=fast), hidden=4)
     random_high(
-        path / "slow", HighLevelConfig(), dataclasses.replace(LOW_CONFIG, physics=physics), hidden=4
+        path / "slow", HIGH_CONFIG, dataclasses.replace(LOW_CONFIG, physics=physics), hidden=4
     )
     for name, stem, key, value in (
         ("blind", path / "high", "cues", "none"),
@@ -480,5 +508,5 @@ def test_missing_package_names_the_extra(
     out = tmp_path / "out"
     assert export.main(["--high", str(high), "--out", str(out)]) == 2
     said = capsys.readouterr()
-    assert "format onnx needs onnxscript: install the extra 'export'" in said.err
+    assert "format onnx,torchscript needs onnxscript: install the extra 'export'" in said.err
     assert said.err.count("\n") == 1 and not out.exists()

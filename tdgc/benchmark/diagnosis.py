@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.evaluation import Episode, EpisodeRecord, tile_of
-from tdgc.benchmark.trace import TRACKED, Trace
+from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
 from tdgc.sim.terrain import (
     GOAL_BEGIN,
     MAX_LEVEL,
@@ -45,6 +45,17 @@ SETTLE = 1.0  # s at the start that are not: speeding up from rest, as in the tr
 #: centre a trunk was hit at up to 0.25 m from a pillar's edge, and a robot held up by one stood at
 #: up to 0.29 m.
 REACH = 0.2
+
+
+#: What a log of a real robot may lack, and a column of the trace that then is empty.
+_TRUTH = {
+    "velocity": "error_vx",
+    "yaw rate": "error_yaw_rate",
+    "trunk height": "base_height",
+    "contacts": "contact_FL",
+    "forces": "trunk_force",
+    "place on a tile": "base_x",
+}
 
 
 @dataclass(frozen=True)
@@ -97,7 +108,8 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
     """Which layer failed in the episode of ``trace``, and why.
 
     Args:
-        trace: of an episode that failed.
+        trace: of an episode that failed. Where it was on no tile, what a simulator alone knows is
+            missing: the evidence says so.
         hips: m, how far ahead of the trunk's centre the robot's hips are.
 
     Raises:
@@ -105,10 +117,12 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
     """
     if trace.outcome == "reached":
         raise ValueError("an episode that reached its goal has not failed")
-    tile = tile_of(trace.seed, trace.family, trace.level, trace.episode)
-    x, y = float(trace["base_x"][-1]), float(trace["base_y"][-1])
-    found = sorted(features(tile, x, y), key=lambda feature: feature[1])
-    feature = f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
+    tile, place, feature = None, "", ""
+    if trace.seed != NO_TILE:
+        tile = tile_of(trace.seed, trace.family, trace.level, trace.episode)
+        x, y = float(trace["base_x"][-1]), float(trace["base_y"][-1])
+        found = sorted(features(tile, x, y), key=lambda feature: feature[1])
+        place, feature = place_of(x), f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
     layer, cause, evidence = _judge(trace, tile, hips)
     return Diagnosis(
         trace.policy,
@@ -119,7 +133,7 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
         trace.seed,
         trace.outcome,
         round(float(trace["time"][-1]), 2),
-        place_of(x),
+        place,
         feature,
         layer,
         cause,
@@ -130,7 +144,7 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
 # ---------------------------------------------------------------------------- which layer
 
 
-def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
+def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[str, str, str]:
     """Layer, cause and evidence."""
     intervals, held = judged(trace), near_pillar(trace, tile, hips + REACH)
     # Against a pillar or over the edge nothing is tracked, and that is no fault of who tracks.
@@ -142,7 +156,9 @@ def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
     lost = [name for name, error in errors.items() if error > limits[name]]
     towards = asked_towards(trace, intervals)
     evidence = _evidence(trace, intervals, errors, limits, towards)
-    down = trace.outcome == "fell" or (trace.outcome == "collided" and not held[-1])
+    # Of a collision on no tile it is said, not measured, that it was not with the ground.
+    tripped = trace.outcome == "collided" and tile is not None and not held[-1]
+    down = trace.outcome == "fell" or tripped
     if trace.family == "mixed" or trace.level > MAX_LEVEL:
         return "terrain", "never trained on", evidence
     if towards < -AWAY:
@@ -154,7 +170,11 @@ def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
     if down:
         return "decisions", "lost its footing on the way elsewhere", evidence
     if trace.outcome == "collided":
-        return "decisions", "steered into a pillar", evidence
+        return (
+            "decisions",
+            f"steered into {'an obstacle' if tile is None else 'a pillar'}",
+            evidence,
+        )
     if trace.outcome == "left_tile":
         return "decisions", "steered off the tile", evidence
     if held[-1]:
@@ -176,7 +196,7 @@ def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, flo
     """Sizes of the mean errors over ``intervals`` (n - 1,), by the names of ``LIMITS``.
 
     A mean over gait cycles: what a trunk sways about its command does not count. Empty without an
-    interval.
+    interval; an error that was not measured is left out.
     """
 
     def mean(name: str) -> float:
@@ -185,11 +205,12 @@ def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, flo
 
     if not intervals.any():
         return {}
-    return {
+    errors = {
         "velocity": float(np.hypot(mean("vx"), mean("vy"))),
         "yaw rate": abs(mean("yaw_rate")),
         "tilt": float(np.hypot(mean("pitch"), mean("roll"))),
     }
+    return {name: error for name, error in errors.items() if np.isfinite(error)}
 
 
 def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
@@ -203,8 +224,10 @@ def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
     return float(np.average(towards[intervals], weights=trace["seconds"][1:][intervals]))
 
 
-def near_pillar(trace: Trace, tile: Tile, reach: float) -> NDArray[np.bool_]:
+def near_pillar(trace: Trace, tile: Tile | None, reach: float) -> NDArray[np.bool_]:
     """Where the trunk was within ``reach`` m of a pillar, (n,): it may be held up by it."""
+    if tile is None:
+        return np.zeros(len(trace["time"]), dtype=bool)
     x, y = trace["base_x"], trace["base_y"]
     return np.array([_to_pillar(tile, *at)[0] < reach for at in zip(x, y, strict=True)])
 
@@ -233,6 +256,9 @@ def _evidence(
         share = np.sum(trace[f"at_bound_{name}"][:-1][intervals] != 0.0) / max(intervals.sum(), 1)
         if share > 0.5:
             words.append(f"{name} at its bound {100 * share:.0f} % of the time")
+    if trace.seed == NO_TILE:
+        missing = [what for what, name in _TRUTH.items() if np.isnan(trace[name]).all()]
+        words.append(f"not known: {', '.join(missing)}")
     span = "all along" if trace.outcome == "timeout" else f"in the last {LOOK_BACK:g} s"
     return f"{span}: {'; '.join(words)}"
 

@@ -42,15 +42,15 @@ class ExportError(InputError):
     """An export that cannot be used; the message is one line."""
 
 
-def require(names: tuple[str, ...], extra: str) -> None:
-    """Refuse to go on without packages of an optional extra.
+def require(what: str, names: tuple[str, ...], extra: str) -> None:
+    """Refuse to do something without the packages of an optional extra that it needs.
 
     Raises:
         ExportError: names those that are missing and what to install.
     """
     missing = [name for name in names if importlib.util.find_spec(name) is None]
     if missing:
-        raise ExportError(f"needs {', '.join(missing)}: {install_hint(extra)}")
+        raise ExportError(f"{what} needs {', '.join(missing)}: {install_hint(extra)}")
 
 
 # ---------------------------------------------------------------------------------------------
@@ -240,6 +240,7 @@ class Controller:
     """
 
     def __init__(self, folder: Path, form: str = "onnx") -> None:
+        self._folder = folder
         self._graphs = {name: Graph(folder, name, form) for name in GRAPHS}
         self.low, self.high = self._graphs["low"], self._graphs["high"]
         low, high = self.low.table, self.high.table
@@ -350,14 +351,16 @@ class Controller:
         position[:, 2] = world.ground_height(x, y).max() + begin["trunk_height"]["value"]
         world.reset_robots([0], position, turn, pose)
 
-    def robot(self, urdf: Path) -> RobotConfig:
-        """The robot of the interface for this package's own simulation; ``urdf`` is its file.
+    def robot(self, urdf: Path | None = None) -> RobotConfig:
+        """The robot of the interface for this package's own simulation; its ``urdf`` is the copy in
+        the folder by default.
 
         Raises:
             ConfigError: a URDF that this package cannot read.
             ExportError: a URDF of another robot, or joints that differ from leg to leg.
         """
         table = self.low.table
+        urdf = urdf or self._folder / table["robot"]["urdf"]["file"]
         control, pose = table["joint_control"], table["start"]["joint_angles"]["value"]
         hip, thigh, calf = pose[:3]
         limits = [tuple(control[k]["value"][:3]) for k in ("torque_limit", "speed_limit")]
