@@ -33,11 +33,11 @@ from tdgc.benchmark.evaluation import (
     plan,
     run_cell,
     spread,
-    tracking,
-    write_results,
 )
 from tdgc.benchmark.recording import Recorder, Recording, Together
+from tdgc.benchmark.results import write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, check_installed, write
+from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, LowLevelConfig
 from tdgc.parallel import cluster

@@ -22,13 +22,14 @@ from tdgc import __version__
 from tdgc.config import PRESETS, ConfigError, HighTrainConfig, to_dict
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
-from tdgc.learn.training import Phase, add_arguments, configure, run
+from tdgc.learn.training import Interruption, Phase, add_arguments, configure, run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import Policy
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
-from tdgc.tasks.high_env import NavigationTask, check_pair, load_low, summarise
+from tdgc.sim.terrain import EDITION
+from tdgc.tasks.high_env import NavigationTask, load_low, paired, summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.teacher import check_styles
 from tdgc.tasks.tiles import check_families
@@ -127,7 +128,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = configure(HighTrainConfig(), args)
         low, low_config = load_low(config.low)
-        check_pair(config.env, low_config)
+        config = dataclasses.replace(config, env=paired(config.env, low_config))
         check_families(config.env.families)
         unknown = config.env.unknown_share
         if not 0.0 <= unknown <= 1.0:
@@ -139,14 +140,18 @@ def main(arguments: list[str] | None = None) -> int:
             "low": {"config": to_dict(low_config), "observation": low.actor_dim},
             "seed": config.seed,
             "code": __version__,
+            "benchmark": EDITION,
         }
         imitated = min(config.imitation.steps, config.steps)
         phases = [
-            Phase(functools.partial(build, config, low, args.device, imitating), until)
-            for imitating, until in ((True, imitated), (False, config.steps))
+            Phase(name, functools.partial(build, config, low, args.device, imitating), until)
+            for name, imitating, until in (
+                ("imitation", True, imitated),
+                ("reinforcement", False, config.steps),
+            )
             if until > 0
         ]
-        run(args, config, phases, meta, summarise)
+        run(args, config, phases, meta, summarise, Interruption(args.time_limit))
     except ValueError as error:
         print(f"train_high.py: {error}", file=sys.stderr)
         return 2

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Train the gait-conditioned low level: first on the plane, then on rising terrain.
+"""Train the gait-conditioned low policy on a plane and on rising terrain, and calibrate it.
 
 python train_low.py                        the whole job
 python train_low.py --time-limit 3600      an hour of it
@@ -12,17 +12,21 @@ import argparse
 import dataclasses
 import functools
 import sys
+from pathlib import Path
 
 import torch as th
 from stable_baselines3 import PPO
+from tqdm import tqdm
 
 from tdgc import __version__, policies
+from tdgc.calibration import calibrate
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, to_dict
-from tdgc.learn.training import Phase, add_arguments, configure, run
+from tdgc.learn.training import Interruption, Phase, add_arguments, configure, run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
 from tdgc.show import plots
+from tdgc.sim.terrain import EDITION
 from tdgc.tasks.low_env import LowLevelTask, make_task, summarise
 from tdgc.tasks.tiles import check_families
 
@@ -41,7 +45,43 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
     physics = dataclasses.replace(env.physics, substeps=steps, hold=1)
     plane = dataclasses.replace(env, terrain="plane", physics=physics)
     tiles = dataclasses.replace(env, terrain="tiles")
-    return [Phase(functools.partial(build, config, (plane, tiles), device), config.steps)]
+    make = functools.partial(build, config, (plane, tiles), device)
+    return [Phase("learning to walk", make, config.steps)]
+
+
+class StoppedError(Exception):
+    """Calibration was interrupted."""
+
+
+def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> None:
+    """The last phase: the calibrated copy takes the place of the policy that learned.
+
+    What learned stays beside it as ``uncalibrated``. An interrupted calibration begins anew when
+    the run is resumed, and ends the same.
+
+    Raises:
+        WorkerError: a worker failed.
+    """
+    learned = policies.load(out / "policy")
+    if not config.calibration.robots or "calibration" in learned.meta:
+        return
+    with tqdm(desc="calibrating", total=100, bar_format="{desc}: {percentage:3.0f}%|{bar}|") as bar:
+
+        def tick(share: float) -> None:
+            bar.update(100.0 * share - bar.n)
+            if interruption.due():
+                raise StoppedError
+
+        try:
+            student, facts = calibrate(
+                learned, config.calibration, config.workers, config.seed, tick
+            )
+        except StoppedError:
+            interruption.tell(out)
+            return
+    policies.save_copy(out / "uncalibrated", learned, learned.actor.tensors(), learned.meta)
+    meta = {**learned.meta, "calibration": facts}
+    policies.save_copy(out / "policy", learned, student.tensors(), meta)
 
 
 def build(
@@ -110,8 +150,15 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = configure(LowTrainConfig(), args)
         check_families(config.env.families)
-        meta = {"config": to_dict(config.env), "seed": config.seed, "code": __version__}
-        run(args, config, phases(config, args.device), meta, summarise)
+        meta = {
+            "config": to_dict(config.env),
+            "seed": config.seed,
+            "code": __version__,
+            "benchmark": EDITION,
+        }
+        interruption = Interruption(args.time_limit)
+        if run(args, config, phases(config, args.device), meta, summarise, interruption):
+            finish(args.out, config, interruption)
     except ValueError as error:
         print(f"train_low.py: {error}", file=sys.stderr)
         return 2

@@ -25,8 +25,9 @@ import torch as th
 from torch import nn
 
 from tdgc import policies
-from tdgc.benchmark.evaluation import draw_commands, spread, walk_on_plane
-from tdgc.config import CommandRanges, LowLevelConfig
+from tdgc.benchmark.evaluation import spread
+from tdgc.benchmark.tracking import draw_commands, walk_on_plane
+from tdgc.config import CalibrationConfig, CommandRanges, LowLevelConfig
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.vec import TaskVecEnv
@@ -37,7 +38,8 @@ from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import ACTOR_LAYOUT, MIRRORS
 from tdgc.sim.robot import Array
 from tdgc.tasks.high_env import load_low
-from tdgc.tasks.low_env import LowLevelTask, is_fallen, make_task
+from tdgc.tasks.low_env import LowLevelTask, make_task
+from tdgc.tasks.rules import is_fallen
 
 #: From the commands asked for to those given, (n, 15) -> (n, 15).
 Correction = Callable[[Array], Array]
@@ -60,6 +62,7 @@ _TURN = 60  # control steps between updates
 _KEPT = 40  # turns whose states are learned from
 _UPDATES, _STATES = 120, 1024  # minibatches a turn, and their size
 _RATE = 3e-4  # of Adam, falling to nothing
+_WALKING, _FITTED = 0.3, 0.4  # about the shares of the time that are over after walking and fitting
 
 _SIGN = np.array(MIRRORS["command"][1])
 _NAMES = [name for name, _ in ACTOR_LAYOUT]
@@ -225,6 +228,7 @@ def distil(
     env: TaskVecEnv,
     turns: int,
     seed: int,
+    tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Actor, float, float]:
     """A student, a copy at first, that learns to do what ``low`` does at corrected commands.
 
@@ -264,6 +268,7 @@ def distil(
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
+        tick((turn + 1) / turns)
     return student, first, last
 
 
@@ -271,27 +276,48 @@ def distil(
 
 
 def calibrate(
-    low: Policy, robots: int, turns: int, workers: int, seed: int
+    low: Policy,
+    calibration: CalibrationConfig,
+    workers: int,
+    seed: int,
+    tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Actor, dict[str, float]]:
-    """Measure, fit and distil: the student, and what is to be known of it (keys say the unit).
+    """Measure, fit and distil.
+
+    Args:
+        low: the policy.
+        calibration: how thoroughly.
+        workers: processes.
+        seed: of everything random here.
+        tick: told now and then which share of the work is done; what it raises ends the work.
+
+    Returns:
+        The student, and what is to be known of it (keys say the unit).
 
     Raises:
         WorkerError: a worker failed.
     """
     config = load_low(low)[1]
+    robots, turns = calibration.robots, calibration.turns
     counts = [min(_BATCH, robots - first) for first in range(0, robots, _BATCH)]
     jobs = [(count, seed * len(counts) + k) for k, count in enumerate(counts)]
-    walks = list(spread(functools.partial(_walk, low), jobs, workers))
+    walks = []
+    for walk in spread(functools.partial(_walk, low), jobs, workers):
+        walks.append(walk)
+        tick(_WALKING * len(walks) / len(jobs))
     given, reached = (np.concatenate(parts) for parts in zip(*walks, strict=True))
     response = ResponseModel(given, reached, config.commands, seed)
     correct = Corrector(response, seed)
+    tick(_FITTED)
     probe = LowLevelTask(dataclasses.replace(config, terrain="plane"), 1, seed=0)
     spaces = probe.observation_space, probe.action_space
     probe.close()
     tasks = functools.partial(training_tasks, config)
     env = TaskVecEnv(tasks, _ROBOTS, workers, seed, spaces, recover=True)
     try:
-        student, first, last = distil(low, correct, env, turns, seed)
+        student, first, last = distil(
+            low, correct, env, turns, seed, lambda done: tick(_FITTED + (1.0 - _FITTED) * done)
+        )
     finally:
         env.close()
     vx, vy, yaw_rate = response.error.tolist()
@@ -323,7 +349,8 @@ def main(arguments: list[str] | None = None) -> int:
         workers = args.workers
         if workers == "auto":
             workers = auto_workers(_ROBOTS, usable_cores())
-        student, facts = calibrate(low, args.robots, args.turns, workers, args.seed)
+        calibration = CalibrationConfig(args.robots, args.turns)
+        student, facts = calibrate(low, calibration, workers, args.seed)
         policies.save_copy(args.out, low, student.tensors(), {**low.meta, "calibration": facts})
     except ValueError as error:
         print(f"tdgc.calibration: {error}", file=sys.stderr)

@@ -186,6 +186,10 @@ class RandomisationConfig:
     # that sees one step needs its joint speeds to tell how fast the trunk moves.
     noise_joint_speed: float = 0.3  # rad/s
     noise_gyro: float = field(default=0.1, metadata={"before": 0.0})  # rad/s
+    # The high policy's height probes (benchmark's `noise`).
+    noise_probes: float = field(default=0.02, metadata={"before": 0.0})  # m
+    # Share of the robots, drawn for each episode, whose probes are a decision late.
+    probe_delay: float = field(default=0.5, metadata={"before": 0.0})
 
 
 @dataclass(frozen=True)
@@ -255,7 +259,8 @@ class HighLevelConfig:
     episode_seconds: float = 20.0  # T_max (benchmark)
     hold_seconds: float = 2.0  # an episode goes on that long after the goal was reached
     action_limit: float = 1.0  # a_max of the decoder
-    commands: CommandRanges = field(default_factory=CommandRanges)  # the decoder's bounds
+    # The decoder's bounds; all that the low policy was trained on where there are none.
+    commands: CommandRanges | None = None
     rewards: HighRewardConfig = field(default_factory=HighRewardConfig)
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
@@ -287,6 +292,14 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
+class CalibrationConfig:
+    """Calibration of the low policy (``tdgc.calibration``), the end of a run of train_low.py."""
+
+    robots: int = 4800  # that walk to be measured; 0 leaves the policy as it is
+    turns: int = 60  # of 60 control steps each, in which the copy learns
+
+
+@dataclass(frozen=True)
 class LowTrainConfig:
     """A run of train_low.py: robots on a plane and on terrain, then calibration."""
 
@@ -301,6 +314,7 @@ class LowTrainConfig:
     checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
     env: LowLevelConfig = field(default_factory=LowLevelConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
 
 
 @dataclass(frozen=True)
@@ -505,6 +519,10 @@ def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
         raise ConfigError(f"unknown configuration key '{full}'; allowed: {', '.join(names)}")
     child = getattr(config, head)
     if rest:
+        if child is None:  # a table that may be left out
+            options = typing.get_args(typing.get_type_hints(type(config))[head])
+            table = next((o for o in options if dataclasses.is_dataclass(o)), None)
+            child = None if table is None else typing.cast(type, table)()
         if not dataclasses.is_dataclass(child):
             raise ConfigError(f"'{full}': '{head}' is a value, it has no keys of its own")
         return dataclasses.replace(config, **{head: _replace(child, rest, value, full)})

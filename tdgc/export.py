@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from tdgc import __version__
-from tdgc.benchmark.drivers import load_high
+from tdgc.benchmark.drivers import HierarchyDriver, load_high
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
 from tdgc.deploy.controller import (
     FORMATS,
@@ -72,14 +72,12 @@ from tdgc.sim.world import World
 from tdgc.tasks.high_env import (
     GOAL_SCALE,
     PRETRAINED,
-    PROBE_RANGE,
-    PROBES,
     SEMANTIC,
     high_layout,
     load_low,
-    observe_high,
 )
-from tdgc.tasks.low_env import GOAL_RADIUS, is_fallen
+from tdgc.tasks.probes import PROBE_RANGE, PROBES
+from tdgc.tasks.rules import GOAL_RADIUS, GOING, outcome
 
 #: Largest difference allowed between graphs and policies, in the units of the outputs: float32
 #: networks of this size differ by about 1e-6 where two libraries add up in another order.
@@ -485,7 +483,7 @@ def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
     high_table = _head("high", pair.high, high, 1.0 / step) | {
         "order": [{"graph": "high", "every": task.decimation}, {"graph": "low", "every": 1}],
         "joints": JOINTS,
-        "commands": _commands(task.commands),
+        "commands": _commands(task.commands or config.commands),
         "gaits": gaits,
         "decision": (*CONTINUOUS, "gait"),
         "families": SEMANTIC,
@@ -618,50 +616,45 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
         ValueError: policies or a folder that cannot be used.
     """
     pair, controller = load_pair(low, high), Controller(folder, form)
-    config, limit = pair.high_config, pair.low_config.robot.action_limit
-    decoder = CommandDecoder(config.commands, config.action_limit)
-    field, rng = TileField((1, 1)), np.random.default_rng(0)
-    field.place(0, 0, make_tile(_CHECKED_ON, 0.5, rng))
-    start, goal = field.starts[0], field.goals[0]
-    physics = dataclasses.replace(pair.low_config.physics, control_dt=controller.dt)
-    world = World(1, controller.robot(urdf_path(pair.low_config.robot)), physics, field)
-    loco = Locomotion(
-        1, pair.low_config.robot, pair.low_config.physics, field, pair.low_config.gyro, world=world
-    )
-    told = np.array([SEMANTIC.index(_CHECKED_ON)])
+    config, limit = pair.low_config, pair.low_config.robot.action_limit
+    driver = HierarchyDriver(pair.high, pair.high_config)
+    decoder = CommandDecoder(driver.bounds, pair.high_config.action_limit)
+    field = TileField((1, 1))
+    field.place(0, 0, make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
+    start, goal = field.starts[:, 0], field.goals[:, 0]
+    physics = dataclasses.replace(config.physics, control_dt=controller.dt)
+    world = World(1, controller.robot(urdf_path(config.robot)), physics, field)
+    loco = Locomotion(1, config.robot, config.physics, field, config.gyro, world=world)
     differences: list[Array] = []
     seconds: list[float] = []
-    step = horizon = round(config.episode_seconds / pair.low_config.physics.control_dt)
+    step, ended = 0, True
     try:
-        for _ in range(horizon):
-            x, y = world.state.position[:, 0], world.state.position[:, 1]
-            over = is_fallen(world) | ~field.on_tile(0, 0, x, y)
-            if step == horizon or over[0] or np.hypot(*(goal[0] - [x[0], y[0]])) < GOAL_RADIUS:
+        for _ in range(controller.horizon):
+            if ended:
                 controller.reset()
                 loco.command[:] = default_command()
                 loco.place(np.arange(1), start[:, :2], start[:, 2], np.zeros(1))
                 controller.place(world, start[0])
-                step, state, last = 0, None, np.zeros((1, NUM_ACTIONS), dtype=np.float32)
-            targets = controller.step(
-                controller.sense(world.state, goal[0], _CHECKED_ON, field.height_at)
-            )
-            made, decided = controller.low.values, controller.high.values
-            if step % config.decimation == 0:
-                # A new episode has the phases of the one before until its first step.
-                loco.clock.update(loco.command[:, 12:], loco.command[:, INDEX["duration"]])
-                share = np.full(1, step / horizon)
-                seen = observe_high(loco, goal, share, decoder.normalise(last), told, config.cues)
-                last, state = pair.high.predict(seen, state)
-                differences += [
-                    decided["decision"] - last[0],
-                    controller.commands - decoder.decode(decided["decision"]),
-                ]
-            loco.command[:] = controller.commands
-            action = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
-            loco.act(made["action"][None])
-            differences += [made["action"] - action[0], targets - loco.targets[0, 0]]
+                driver.begin(loco, goal, _CHECKED_ON)
+                step = 0
+            readings = controller.sense(world.state, goal[0], _CHECKED_ON, field.height_at)
+            targets = controller.step(readings)
             seconds.append(controller.seconds)
+            driver.command(step)
+            assert driver.action is not None
+            decision = controller.high.values["decision"]
+            loco.command[:] = controller.commands
+            wanted = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
+            action = controller.low.values["action"]
+            loco.act(action[None])
+            differences += [
+                decision - driver.action[0],
+                controller.commands - decoder.decode(decision),
+                action - wanted[0],
+                targets - loco.targets[0, 0],
+            ]
             step += 1
+            ended = bool(outcome(world, goal)[0] != GOING)
     finally:
         world.close()
     return Check(float(np.abs(np.concatenate(differences)).max()), np.array(seconds))

@@ -22,7 +22,9 @@ from tdgc.tasks.low_env import LowLevelTask
 
 RANGES = CommandRanges()
 HALF = np.array([1.0, 0.6, 1.0])  # of the velocity ranges
-CONFIG = LowLevelConfig(families=("rough", "stair"), physics=PhysicsConfig(substeps=4))
+CONFIG = LowLevelConfig(
+    families=("rough", "stair"), physics=PhysicsConfig(substeps=4, hold=1), gyro=False
+)
 
 
 def commands(n: int, width: float = 1.0) -> Array:

@@ -18,7 +18,8 @@ from tdgc.benchmark.trace import COLUMNS, Trace, Tracer
 from tdgc.sim.commands import INDEX
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.tasks.high_env import PRETRAINED, PROBES, load_low
+from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.probes import PROBES
 
 HIPS = 0.183  # m, of the shipped robot
 
@@ -54,8 +55,8 @@ class WeakMotor(HierarchyDriver):
 
     joint = 0
 
-    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
-        super().begin(loco, goal, family)
+    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
+        super().begin(loco, goal, *told)
         loco.world.strength = np.ones((loco.num_robots, 12))
         loco.world.strength[:, self.joint] = 0.02
 
@@ -63,12 +64,13 @@ class WeakMotor(HierarchyDriver):
 class Blindfold(HierarchyDriver):
     """The high level sees flat ground of an unknown family and a goal where there is none."""
 
-    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
         angle = np.random.default_rng(0).uniform(-np.pi, np.pi, loco.num_robots)
         here = loco.world.state.position[:, :2]
         c, s = np.cos(angle), np.sin(angle)
         x, y = (goal - here).T
-        super().begin(loco, here + np.stack([c * x - s * y, s * x + c * y], axis=1), "mixed")
+        turned = here + np.stack([c * x - s * y, s * x + c * y], axis=1)
+        super().begin(loco, turned, "mixed")
 
     def command(self, step: int) -> Array:
         def blind(*arguments: Any) -> Any:

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,24 +19,21 @@ from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import (
     BATCH,
     CONDITIONS,
-    OUTCOMES,
     Cell,
-    Episode,
-    classify,
     low_config,
     physics_of,
     plan,
     push_velocities,
     run_cell,
-    summarise,
     tile_of,
-    wilson_interval,
 )
+from tdgc.benchmark.tracking import track_gait
+from tdgc.config import RandomisationConfig
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import EVAL_STREAM, TileField, make_tile, tile_rng
 from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.rules import OUTCOMES
 
 
 @pytest.fixture(scope="module")
@@ -67,15 +65,6 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_wilson_interval_is_the_textbook_one():
-    # Wilson's interval of 8 in 10 at 95 %: 0.4902 to 0.9433 (e.g. Newcombe 1998, method 3).
-    low, high = wilson_interval(8, 10)
-    assert low == pytest.approx(0.4902, abs=5e-5) and high == pytest.approx(0.9433, abs=5e-5)
-    assert wilson_interval(0, 20)[0] == 0.0 and wilson_interval(20, 20)[1] == 1.0
-    with pytest.raises(ValueError, match=r"0 <= reached <= n"):
-        wilson_interval(3, 2)
-
-
 def test_plan_has_every_cell_once_and_fewer_episodes_off_nominal():
     cells = plan(["gp"], ["nominal", "mixed", "levels-11-12"], ["rough", "gap"], [6, 7], 100)
     count = {
@@ -98,7 +87,7 @@ def test_plan_has_every_cell_once_and_fewer_episodes_off_nominal():
 def test_conditions_are_the_benchmarks():
     assert list(CONDITIONS) == [
         "nominal", "levels-11-12", "mixed", "friction-0.4", "payload-3kg", "pushes", "motor-0.85",
-        "latency-30ms", "physics-1000hz",
+        "latency-30ms", "physics-1000hz", "noise", "no-family",
     ]  # fmt: skip
     assert CONDITIONS["friction-0.4"].friction == 0.4
     assert CONDITIONS["payload-3kg"].payload == 3.0
@@ -124,35 +113,11 @@ def test_pushes_have_their_size_and_are_paired():
     assert np.array_equal(pushes[2:], later)
 
 
-def test_outcomes_are_told_apart(low):
-    config = low_config(low)
-    field = TileField((5, 1))
-    for k in range(5):
-        field.place(k, 0, make_tile("rough", 0.0, tile_rng(0, "rough", 0, k, EVAL_STREAM)))
-    loco = Locomotion(5, config.robot, config.physics, field)
-    try:
-        origin = field.origin(np.arange(5), 0)
-        goal = field.goals[:, 0] + origin
-        xy = origin + np.array([4.0, 4.0])
-        xy[0] = goal[0] + [0.49, 0.0]
-        xy[1] = origin[1] + [4.0, -0.01]
-        loco.place(np.arange(5), xy, np.zeros(5), np.zeros(5))
-        loco.world.state.trunk_force[2] = 40.1
-        loco.world.state.position[3, 2] = 0.139  # the ground is within 1 cm of 0
-        ends = classify(loco, goal, field)
-        names = [OUTCOMES[i] if i >= 0 else "going" for i in ends]
-        assert names == ["reached", "left_tile", "collided", "fell", "going"]
-        loco.world.state.position[0, 2] = 0.1  # falling into the goal is falling
-        assert OUTCOMES[classify(loco, goal, field)[0]] == "fell"
-    finally:
-        loco.world.close()
-
-
 class Watcher(BaselineDriver):
     """A baseline that notes what it was given."""
 
-    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
-        super().begin(loco, goal, family)
+    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
+        super().begin(loco, goal, *told)
         assert loco.world.field is not None
         start = loco.world.state
         poses = [start.position, start.quaternion, start.q]
@@ -189,11 +154,57 @@ def test_an_episode_alone_and_twice(low, monkeypatch):
         assert 0.1 < direct <= a.path_m + 1e-9  # its way is longer than its chords
 
 
+class Told(BaselineDriver):
+    """A baseline that notes the robots' clocks, what it is told and their joint targets."""
+
+    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
+        super().begin(loco, goal, *told)
+        self.loco, self.told, self.clock = loco, told, loco.clock.clock.copy()
+
+
+def test_noise_follows_from_the_episode(low, monkeypatch):
+    """Clock, sensors and probes of an episode are the same alone, in a batch, for any policy."""
+    monkeypatch.setattr(evaluation, "HORIZON", 0.1)
+    runs = {}
+    for key, policy, condition, first, count in (
+        ("batch", "gp", "noise", 2, 3),
+        ("other policy", "tdgc", "noise", 2, 3),
+        ("alone", "gp", "noise", 3, 1),
+        ("exact", "gp", "nominal", 2, 3),
+    ):
+        driver = Told()
+        run_cell(Cell(policy, condition, "rough", 6, first, count), low, driver, seed=5)
+        noise = driver.told[1]
+        probes = None if noise is None else noise.draws.uniform(-1.0, 1.0, (count, 4))
+        runs[key] = (driver.clock, driver.loco.targets[0], probes)
+    for mine, same, alone in zip(runs["batch"], runs["other policy"], runs["alone"], strict=True):
+        assert np.array_equal(mine, same)
+        assert mine[1:2] == pytest.approx(alone, abs=1e-5)  # another size of batch rounds otherwise
+    assert len(set(runs["batch"][0])) == 3 and (runs["exact"][0] == 0.0).all()
+    assert runs["exact"][2] is None
+    # Noise of 0.01 rad in the joints is seen in their targets.
+    assert np.abs(runs["batch"][1] - runs["exact"][1]).max() > 0.01
+
+
+def test_noise_is_that_of_training_and_all_probes_are_late():
+    noise = CONDITIONS["noise"].noise
+    assert noise == dataclasses.replace(RandomisationConfig(), probe_delay=1.0)
+    assert noise.noise_probes == 0.02 and noise.scale == 1.0
+
+
+def test_without_a_family_it_is_unknown(low, monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 0.02)
+    for condition, told in (("nominal", "rough"), ("no-family", "unknown")):
+        driver = Told()
+        run_cell(Cell("gp", condition, "rough", 6, 0, 1), low, driver, seed=5)
+        assert driver.told == (told, None)
+
+
 class Recorder(HierarchyDriver):
     """A hierarchy that notes what it commanded."""
 
-    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
-        super().begin(loco, goal, family)
+    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
+        super().begin(loco, goal, *told)
         self.said: list[Array] = []
 
     def command(self, step: int) -> Array:
@@ -213,28 +224,8 @@ def test_shares_are_of_the_gaits_commanded(low, high, monkeypatch):
         assert sum(episode.shares) == pytest.approx(1.0)
 
 
-def test_summary_counts_and_averages():
-    def row(family: str, level: int, outcome: str) -> Episode:
-        nothing = np.zeros((1, 3))
-        shares = (1.0, 0.0, 0.0, 0.0)
-        where = ("gp", "nominal", family, level, 0, 0)
-        return Episode(*where, outcome, 1.0, 1.0, 1.0, shares, nothing[0, :2], nothing)
-
-    rows = [
-        row("rough", 6, "reached"), row("rough", 6, "fell"),
-        row("rough", 7, "reached"), row("rough", 7, "reached"),
-        row("gap", 6, "timeout"), row("gap", 6, "left_tile"),
-        row("gap", 7, "collided"), row("gap", 7, "reached"),
-    ]  # fmt: skip
-    table = summarise(rows)["gp"]["nominal"]
-    assert table["rough"]["6"]["rate"] == 0.5 and table["rough"]["mean"]["rate"] == 0.75
-    assert table["gap"]["mean"]["reached"] == 1
-    assert table["mean"]["n"] == 8 and table["mean"]["rate"] == 0.5
-    assert table["mean"]["ci_low"] < 0.5 < table["mean"]["ci_high"]
-
-
 def test_tracking_measures_against_the_command(low):
-    result = evaluation.track_gait(low, "trot", episodes=2, seed=0)
+    result = track_gait(low, "trot", episodes=2, seed=0)
     assert set(result) == {"velocity_rmse", "yaw_rate_rmse", "contact_match"}
     # A policy that stood still would be off by the commands' own spread, sqrt((1 + 0.36) / 3).
     assert 0.0 < result["velocity_rmse"] < math.sqrt((1.0 + 0.36) / 3.0)

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from tdgc import export, policies
-from tdgc.config import CommandRanges, HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
+from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
 from tdgc.deploy.controller import FORMATS, Graph
 from tdgc.export import TOLERANCE, HighLevel, LowLevel
 from tdgc.learn.recurrent import FastRecurrentPolicy
@@ -32,6 +32,7 @@ from tdgc.sim.locomotion import (
 )
 from tdgc.sim.robot import JOINTS, nominal_pose
 from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_layout, load_low, observe_high
+from tdgc.tasks.probes import height_probes
 
 LOW = PRETRAINED / "low"
 LOW_POLICY, LOW_CONFIG = load_low(LOW)
@@ -85,7 +86,7 @@ def random_low(path: Path, config: LowLevelConfig, symmetric: bool) -> Policy:
 
 
 def random_commands(rng: np.random.Generator, count: int) -> np.ndarray:
-    decoder = CommandDecoder()
+    decoder = CommandDecoder(HIGH_CONFIG.commands)
     commands = rng.uniform(decoder.low, decoder.high, (count, 15))
     commands[:, 12:] = gait_embedding(np.arange(count) % 4)
     return commands
@@ -203,7 +204,7 @@ def test_low_level_is_the_executors_step(
 
 @pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])
 def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: str) -> None:
-    narrow = dataclasses.replace(LOW_CONFIG.commands, vx=(-0.5, 0.8), pitch=(0.0, 0.0))
+    narrow = dataclasses.replace(HIGH_CONFIG.commands, vx=(-0.5, 0.8), pitch=(0.0, 0.0))
     config = HighLevelConfig(cues=cues, action_limit=2.0, decimation=4, commands=narrow)
     policy = policies.load(random_high(tmp_path / "high", config))
     level = HighLevel(policy, config, LOW_CONFIG)
@@ -218,7 +219,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: s
         elapsed = np.arange(5) * 17
         seen = observe_high(
             loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
-            task.family_index, cues,
+            task.family_index, cues, height_probes(loco),
         )  # fmt: skip
         wanted, (hidden, cell) = policy.predict(seen, (memory[:1], memory[1:]))
         state = loco.world.state
@@ -251,7 +252,10 @@ def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: s
 
 def test_decoding_is_the_decoders_to_the_last_bit_of_a_gait(high: Path) -> None:
     pair = export.load_pair(LOW, high)
-    level, decoder = HighLevel(pair.high, pair.high_config, pair.low_config), CommandDecoder(HIGH_CONFIG.commands)
+    level, decoder = (
+        HighLevel(pair.high, pair.high_config, pair.low_config),
+        CommandDecoder(HIGH_CONFIG.commands),
+    )
     rng = np.random.default_rng(3)
     actions = rng.uniform(-1.3, 1.3, (40, 13))
     edges = np.float32([-0.5, 0.0, 0.5])
@@ -452,7 +456,7 @@ def test_command_writes_checks_and_reports(
 
 def save_pairs(path: Path) -> None:
     """High levels that do not fit the shipped low level, and one that does."""
-    fast = dataclasses.replace(LOW_CONFIG.commands, vx=(-1.0, 1.5))
+    fast = dataclasses.replace(HIGH_CONFIG.commands, vx=(-1.0, 1.5))
     physics = dataclasses.replace(LOW_CONFIG.physics, control_dt=0.01)
     random_high(path / "high", HIGH_CONFIG, hidden=4)
     random_high(path / "fast", HighLevelConfig(commands=fast), hidden=4)
@@ -478,7 +482,7 @@ def save_pairs(path: Path) -> None:
         ("--high {0}/high --low {0}/absent", "absent.json: no such file"),
         ("--high {0}/high --low {0}/high", "high: not a low-level policy"),
         ("--high {low}", "low: not a high-level policy"),
-        ("--high {0}/fast", "commands.vx asks for [-1.0, 1.5], but the low level was trained on"),
+        ("--high {0}/fast", "commands.vx asks for [-1.0, 1.5], but the low policy was trained on"),
         ("--high {0}/slow", "trained for a low level with a control step of 0.01 s, not 0.02"),
         ("--high {0}/blind", "trained for a high level that observes 48 values, not 86"),
         ("--high {0}/high --low {0}/dizzy", "dizzy: its configuration gives "),

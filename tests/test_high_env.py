@@ -11,20 +11,23 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import tdgc  # noqa: F401  registers the environments
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, HighRewardConfig
+from tdgc.config import ConfigError, HighLevelConfig, HighRewardConfig
+from tdgc.sim.locomotion import Locomotion
 from tdgc.tasks import rewards
+from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import (
     PRETRAINED,
-    PROBES,
     SEMANTIC,
     NavigationTask,
-    check_pair,
     high_layout,
     load_low,
+    paired,
 )
+from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rewards import HighStep
 
 LOW = PRETRAINED / "low"
+CONFIG = HighLevelConfig(commands=load_low(LOW)[1].commands)
 
 
 def columns(cues: str) -> dict[str, slice]:
@@ -38,7 +41,7 @@ def columns(cues: str) -> dict[str, slice]:
 
 @pytest.fixture
 def task():
-    task = NavigationTask(HighLevelConfig(), LOW, 5, seed=3, training=False)
+    task = NavigationTask(CONFIG, LOW, 5, seed=3, training=False)
     task.reset(np.arange(5))
     yield task
     task.close()
@@ -131,7 +134,7 @@ def test_layout_and_cues():
 
 def test_some_robots_in_training_are_not_told_their_family():
     """Of 20 robots of two families the last two of each; in an evaluation all are told."""
-    config = HighLevelConfig(families=("tilt", "rough"), unknown_share=0.2)
+    config = dataclasses.replace(CONFIG, families=("tilt", "rough"), unknown_share=0.2)
     where = columns("both")["family"]
     for training, unknown in ((True, [16, 17, 18, 19]), (False, [])):
         task = NavigationTask(config, LOW, 20, seed=0, training=training)
@@ -165,10 +168,33 @@ def test_probes_see_what_is_ahead(task):
     task.field.heights[int(np.ceil(x / 0.05)) : 2 * n] = 0.3
     xy = state.position[:, :2].copy()
     task.locomotion.place(np.arange(5), xy, np.zeros(5), np.zeros(5))
+    task._probes.begin(np.arange(5))
     probes = task.observe()[1, columns("both")["probes"]] * 0.5
     standing = state.position[1, 2] - 0.30
     assert probes[row] == pytest.approx(0.3 - standing, abs=1e-6)
     assert probes[near] == pytest.approx(-standing, abs=1e-6)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_sensors_are_noisy_in_training_only(training):
+    """What the low policy observes, and the probes."""
+    task = NavigationTask(CONFIG, LOW, 5, seed=3, training=training)
+    exact = Locomotion(
+        5, task.low_config.robot, task.low_config.physics, task.field, task.low_config.gyro
+    )
+    try:
+        task.reset(np.arange(5))
+        loco = task.locomotion
+        seen = task.observe()[:, columns("both")["probes"]] * PROBE_RANGE
+        off = np.abs(seen - height_probes(loco))
+        assert (off.max() > 0.01) == training and off.max() <= 0.02 + 1e-6
+        exact.load_state_dict(loco.state_dict())
+        task._executor.step(task.decoder.decode(np.zeros((5, 13))))
+        Executor(exact, task.low).step(task.decoder.decode(np.zeros((5, 13))))
+        assert np.array_equal(loco.actions[0], exact.actions[0]) != training
+    finally:
+        task.close()
+        exact.world.close()
 
 
 def test_family_is_one_hot(task):
@@ -199,7 +225,9 @@ def test_reaching_the_goal_counts_once_and_ends_after_the_hold(task):
 
 
 def test_curriculum_moves_levels_and_redraws_tiles():
-    config = HighLevelConfig(families=("stair",), window=2, threshold=2, episode_seconds=0.2)
+    config = dataclasses.replace(
+        CONFIG, families=("stair",), window=2, threshold=2, episode_seconds=0.2
+    )
     task = NavigationTask(config, LOW, 2, seed=0)
     try:
         task.reset(np.arange(2))
@@ -211,23 +239,21 @@ def test_curriculum_moves_levels_and_redraws_tiles():
             assert truncated.all() and not terminated.any()
             task.reset(np.arange(2))
         assert task.curriculum.levels.tolist() == [1, 0]
-        n = 161
-        # d = 0.1: risers of 0.04 m, eight of them; d = 0: 0.03 m.
-        assert task.field.heights[:n].max() == pytest.approx(8 * 0.04)
-        assert task.field.heights[n:].max() == pytest.approx(8 * 0.03)
+        rises = [task.field.features[k, 0].risers[0, 1] for k in range(2)]
+        assert rises == pytest.approx([0.042, 0.03])  # d = 0.1 and d = 0
     finally:
         task.close()
 
 
 def test_robots_begin_spread_over_the_first_levels():
-    config = HighLevelConfig(families=("stair", "gap"), first_levels=3)
+    config = dataclasses.replace(CONFIG, families=("stair", "gap"), first_levels=3)
     task = NavigationTask(config, LOW, 8, seed=0)
     assert task.curriculum.levels.tolist() == [0, 0, 1, 1, 2, 2, 0, 0]
     task.close()
 
 
 def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
-    config = HighLevelConfig(families=("stair", "gap"), episode_seconds=0.2)
+    config = dataclasses.replace(CONFIG, families=("stair", "gap"), episode_seconds=0.2)
     task = NavigationTask(config, LOW, 40, seed=2, guided=8)
     try:
         task.reset(np.arange(40))
@@ -255,7 +281,7 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
 def test_the_future_follows_from_the_state(episodes, guided):
     """That of episodes under way after ``forget``, which then end on the way; that of new ones
     after ``restart``."""
-    config = HighLevelConfig(families=("rough", "gap"), episode_seconds=0.8)
+    config = dataclasses.replace(CONFIG, families=("rough", "gap"), episode_seconds=0.8)
     first = NavigationTask(config, LOW, 3, seed=1, guided=guided)
     second = NavigationTask(config, LOW, 3, seed=1, guided=guided)
     try:
@@ -305,11 +331,11 @@ def test_a_robot_that_blows_up_in_a_decision_is_seen_in_the_observation(task):
 
 def test_bounds_outside_the_low_levels_training_are_refused():
     _, low = load_low(LOW)
-    wide = HighLevelConfig(commands=dataclasses.replace(CommandRanges(), vx=(-1.0, 1.5)))
+    wide = HighLevelConfig(commands=dataclasses.replace(CONFIG.commands, vx=(-1.0, 1.5)))
     with pytest.raises(ConfigError, match=r"commands.vx asks for \[-1.0, 1.5\].*\[-1.0, 1.0\]"):
-        check_pair(wide, low)
-    narrow = HighLevelConfig(commands=dataclasses.replace(CommandRanges(), vx=(-0.5, 0.5)))
-    check_pair(narrow, low)
+        paired(wide, low)
+    narrow = HighLevelConfig(commands=dataclasses.replace(CONFIG.commands, vx=(-0.5, 0.5)))
+    paired(narrow, low)
 
 
 def test_nan_action_is_refused(task):

@@ -1,81 +1,104 @@
-"""Leaps: when feet land at either side of a trench; what is measured of a low level."""
+"""Leaps: where feet land on the way over trenches, and what is measured of a low policy."""
 
 import numpy as np
 import pytest
 
+from tdgc.config import CommandRanges
+from tdgc.sim.robot import Array
+from tdgc.sim.terrain import make_tile
 from tdgc.tasks.high_env import PRETRAINED, load_low
-from tdgc.tasks.leaps import LANDING, Landing, measure_landing, straddling_frequency
+from tdgc.tasks.leaps import (
+    STRIDE,
+    Landing,
+    LeapPlan,
+    foothold_risk,
+    leap_command,
+    measure_landing,
+)
 
 LOW = PRETRAINED / "low"
+RANGES = CommandRanges()
+LANDING = Landing(0.22, 0.01)
 
 
-def frequency(
-    x: float,
-    clock: float,
-    length: float = 0.345,
-    speed: float = 1.0,
-    landing: Landing = LANDING,
-) -> float:
-    """Of one robot, before trenches at 2.1 m and 3.35 m, with a stride of 0.4 m."""
-    one = np.ones(1)
-    timed = straddling_frequency(
-        x * one, speed * one, clock * one, 0.4 * one, length * one, np.array([[2.1, 3.35]]), landing
-    )
-    return float(timed[0])
+def land(trenches: Array, clock: float = 0.0, x: float = 0.75) -> tuple[list[float], list[float]]:
+    """Places of front and rear feet of a point that leaps at 1 m/s, decided ten times a second."""
+    plan = LeapPlan(1, RANGES)
+    plan.look(0, trenches, LANDING.spread)
+    one, front, rear, length = np.ones(1), [], [], STRIDE
+    frequency = 2.5
+    for step in range(330):
+        if step % 5 == 0:
+            row = np.zeros(1, dtype=int)
+            f, wanted = plan.steps(row, x * one, one, clock * one, LANDING)
+            frequency, length = float(f[0]), float(wanted[0])
+        x, clock = x + 0.02, clock + 0.02 * frequency
+        if clock >= 1.0:
+            clock -= 1.0
+            front.append(x - clock / frequency + LANDING.front)
+            rear.append(front[-1] - length - LANDING.spread)
+    return front, rear
 
 
-ON_TIME = 2.1 - 0.2 - 0.2  # m: the trunk when the feet land half a stride before the centre
+@pytest.mark.parametrize("level", [4, 8, 10])
+def test_planned_landings_miss_the_trenches(level: int) -> None:
+    """Of 20 tiles a level, from any phase of the gait: all feet at least 1 cm from each lip, but
+    for one landing in a hundred."""
+    feet = []
+    for seed in range(20):
+        trenches = make_tile("gap", level / 10, np.random.default_rng(seed)).features.trenches
+        front, rear = land(trenches, clock=seed / 20)
+        places = np.array([*front, *rear])[:, None]
+        away = np.maximum(trenches[:, 0] - places, places - trenches[:, 1]).min(axis=1)
+        feet += [away]
+    away = np.concatenate(feet)
+    assert np.mean(away < 0.01) < 0.01 and len(away) > 500
 
 
-def test_timing_puts_landings_at_either_side_of_a_trench() -> None:
-    """Feet land 0.20 m ahead, all on one line."""
-    assert frequency(ON_TIME, 0.0) == pytest.approx(2.5)
-    assert frequency(ON_TIME + 0.1, 0.25) == pytest.approx(2.5)  # a quarter of a cycle later
-    assert frequency(ON_TIME + 0.4, 0.0) == pytest.approx(2.5)  # the landing behind it
-    assert frequency(ON_TIME + 1.25, 0.0) == pytest.approx(2.5)  # before the next one
-    # Too far for its clock by a tenth of a stride: step sooner.
-    assert frequency(ON_TIME + 0.04, 0.0) == pytest.approx(2.5 * 1.15)
-    assert frequency(ON_TIME - 0.04, 0.0) == pytest.approx(2.5 * 0.85)
-    # Rear feet 2 cm closer to the front ones: the middle of the two lines is 1 cm ahead.
-    assert frequency(ON_TIME - 0.01, 0.0, length=0.325) == pytest.approx(2.5)
+def test_without_trenches_strides_are_the_usual_ones() -> None:
+    front, rear = land(np.empty((0, 2)))
+    np.testing.assert_allclose(np.diff(front), STRIDE, atol=0.03)
+    np.testing.assert_allclose(np.array(front[1:]) - STRIDE, front[:-1], atol=0.03)
+    assert np.abs(np.array(rear[1:]) - front[:-1]).max() < 0.05  # where the front feet stood
 
 
-def test_timing_keeps_the_stride_at_any_speed_above_that_of_the_start() -> None:
-    assert frequency(ON_TIME, 0.0, speed=1.2) == pytest.approx(3.0)
-    assert frequency(ON_TIME, 0.0, speed=0.1) == pytest.approx(2.5)  # as for 1 m/s
+def test_risk_of_a_foothold() -> None:
+    trenches = np.array([[1.0, 1.3], [2.0, 2.2]])
+    risk = foothold_risk(np.array([0.5, 0.9, 0.96, 1.0, 1.15, 1.34, 2.1, 3.0]), trenches)
+    np.testing.assert_allclose(risk, [0.0, 0.0, 0.25, 1.0, 4.0, 0.25, 4.0, 0.0], atol=1e-9)
 
 
-def test_timing_knows_where_a_low_level_lands() -> None:
-    """Front feet 3 cm further ahead and rear ones 2 cm further apart: lines 2 cm further on."""
-    assert frequency(ON_TIME - 0.02, 0.0, landing=Landing(0.23, 0.075)) == pytest.approx(2.5)
+def test_a_slow_robot_is_timed_for_the_speed_of_a_leap() -> None:
+    """At 2 Hz from rest robots are thrown down."""
+    plan = LeapPlan(1, RANGES)
+    one, row = np.ones(1), np.zeros(1, dtype=int)
+    frequency, _ = plan.steps(row, one, 0.1 * one, 0.0 * one, LANDING)
+    assert frequency[0] == pytest.approx(1.0 / STRIDE, abs=0.05)
 
 
-def ahead(landing: Landing) -> float:
-    """m, what of a landing the timing depends on."""
-    return landing.front - 0.5 * landing.spread
+def test_the_command_of_a_leap() -> None:
+    command = np.tile(np.arange(15.0), (2, 1))
+    leap_command(command, [2.2, 2.4], 0.36)
+    assert command[:, 4].tolist() == [2.2, 2.4] and command[:, 10].tolist() == [0.36] * 2
+    assert command[:, 6].tolist() == [0.07] * 2
+    assert command[:, 12:].tolist() == [[0.0, 0.0, 0.0]] * 2  # pronk
+    assert command[0, :4].tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
-def test_landing_of_the_shipped_low_level() -> None:
-    """The same, to a centimetre, whatever the leaps it is measured with are timed for: its feet
-    leave 3 cm at either side of the 30 cm that the widest trench has at its top."""
-    low, config = load_low(LOW)
-    found = measure_landing(low, config, 5)
-    assert found != LANDING
-    assert -0.02 < found.spread < 0.02
-    for shift in (-0.03, 0.03):
-        assumed = Landing(LANDING.front + shift, LANDING.spread)
-        assert ahead(measure_landing(low, config, 5, assumed)) == pytest.approx(
-            ahead(found), abs=0.01
-        )
+def test_landing_of_the_shipped_low_policy() -> None:
+    found = measure_landing(*load_low(LOW))
+    assert 0.15 < found.front < 0.30 and -0.03 < found.spread < 0.12
+    assert found != Landing()
 
 
 class Limp:
-    """A low level that does nothing."""
+    """A low policy that does nothing."""
 
     def predict(self, observation: np.ndarray) -> tuple[np.ndarray, None]:
         return np.zeros((len(observation), 12)), None
 
 
-def test_a_low_level_that_cannot_leap_has_the_default_landing() -> None:
+def test_a_low_policy_that_does_not_move_has_some_landing() -> None:
     _, config = load_low(LOW)
-    assert measure_landing(Limp(), config, 5) == LANDING  # type: ignore[arg-type]
+    found = measure_landing(Limp(), config)  # type: ignore[arg-type]
+    assert np.isfinite([found.front, found.spread]).all()

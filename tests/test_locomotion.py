@@ -14,11 +14,13 @@ from tdgc.sim.gaits import GAITS, gait_embedding, swing_profile
 from tdgc.sim.locomotion import (
     ACTOR_LAYOUT,
     GYRO_LAYOUT,
+    GYRO_SCALE,
     SPEED_SCALE,
     Locomotion,
     action_mirror,
 )
 from tdgc.sim.robot import Array, commanded_pose, nominal_pose
+from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, Tile, make_tile
 from tdgc.tasks.low_env import CRITIC_LAYOUT, LowLevelTask
 
@@ -142,8 +144,13 @@ def test_noise_is_on_measured_parts_only_and_within_its_width(loco: Locomotion) 
     quiet = loco.observe()
     noise = RandomisationConfig(noise_gravity=0.05, noise_joint_angle=0.01, noise_joint_speed=1.5)
     rng = np.random.default_rng(0)
-    error = np.array([loco.observe(noise, rng) - quiet for _ in range(200)])
-    widths = {"gravity": 0.05, "joint_error": 0.01, "joint_speed": 1.5 * SPEED_SCALE}
+    error = np.array([loco.observe(Noise(noise, rng)) - quiet for _ in range(200)])
+    widths = {
+        "gravity": 0.05,
+        "joint_error": 0.01,
+        "joint_speed": 1.5 * SPEED_SCALE,
+        "gyro": 0.1 * GYRO_SCALE,
+    }
     for name, where in ACTOR.items():
         largest = np.abs(error[..., where]).max(axis=(0, 1))
         width = widths.get(name, 0.0)
@@ -151,7 +158,7 @@ def test_noise_is_on_measured_parts_only_and_within_its_width(loco: Locomotion) 
         assert (largest >= 0.9 * width).all(), name
         assert abs(error[..., where].mean()) <= 0.05 * width, name
     off = dataclasses.replace(noise, scale=0.0)
-    assert (loco.observe(off, rng) == quiet).all()
+    assert (loco.observe(Noise(off, rng)) == quiet).all()
     assert (loco.observe() == quiet).all()
 
 
@@ -423,7 +430,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
     assert np.abs(probes[:, 0] - probes[:, 2]).max() > 0.04 and np.ptp(probes[:, 1]) > 0.2
     assert np.ptp(critic[where["foot_height"]]) > 0.005
     dynamics = critic[where["dynamics"]].tolist()
-    assert dynamics == pytest.approx([0.6, 0.5, 0.0, 0.4])
+    assert dynamics == pytest.approx([0.6, 0.5, 0.0, 0.4, 0.0, 0.0])
     task.close()
 
 

@@ -10,7 +10,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from tdgc.benchmark.evaluation import Episode, tile_of, write_results
+from tdgc.benchmark.evaluation import Episode, tile_of
+from tdgc.benchmark.results import write_results
 from tdgc.show import plots
 from tdgc.sim.robot import Array
 

@@ -9,7 +9,9 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
+from tdgc import policies
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.policies import Mirror
 
 OBS, ACT, HIDDEN = 6, 2, 16
 ENVS, STEPS = 5, 12
@@ -212,3 +214,57 @@ def test_other_distributions_are_refused():
 def test_a_minibatch_below_one_rollout_is_refused():
     with pytest.raises(ValueError, match=r"^a minibatch of 11 steps does not hold the 12 of one"):
         make_model(FastRecurrentPolicy, batch_size=11)
+
+
+# ------------------------------------------------------------------ left and right
+
+#: Two pairs of sides, a component along the middle and one across it; one action of each kind.
+MIRROR = Mirror((1, 0, 3, 2, 4, 5), (1.0, 1.0, -1.0, -1.0, 1.0, -1.0), (0, 1), (1.0, -1.0))
+
+
+def run_through(policy, observations: np.ndarray, starts: np.ndarray) -> tuple[th.Tensor, ...]:
+    """Mean actions and values of (STEPS, ENVS, OBS), step by step with what is remembered."""
+    size = policy.lstm_actor.hidden_size
+    zeros = (th.zeros(1, ENVS, size), th.zeros(1, ENVS, size))
+    states, actions, values = RNNStates(zeros, zeros), [], []
+    for seen, start in zip(observations, starts, strict=True):
+        seen, start = th.as_tensor(seen), th.as_tensor(start)
+        with th.no_grad():
+            action, value, _, states = policy(seen, states, start, deterministic=True)
+        actions.append(action)
+        values.append(value)
+    return th.stack(actions), th.stack(values)
+
+
+def test_a_mirrored_policy_is_symmetric_and_learning_keeps_it_so():
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(STEPS, ENVS, OBS)).astype(np.float32)
+    starts = (rng.random((STEPS, ENVS)) < 0.2).astype(np.float32)
+    image = seen[..., list(MIRROR.obs_index)] * np.float32(MIRROR.obs_sign)
+    model = make_model(FastRecurrentPolicy, policy_kwargs={"mirror": MIRROR})
+    before = [p.clone() for p in model.policy.parameters()]
+    for _ in range(2):
+        actions, values = run_through(model.policy, seen, starts)
+        mirrored, same = run_through(model.policy, image, starts)
+        th.testing.assert_close(mirrored, actions * th.tensor([1.0, -1.0]))
+        th.testing.assert_close(same, values)
+        assert actions.std() > 1e-4 and (mirrored - actions).abs().max() > 1e-4
+        model.learn(2 * STEPS * ENVS)
+    after = list(model.policy.parameters())
+    assert all((a != b).any() for a, b in zip(after, before, strict=True))
+
+
+def test_a_mirrored_policy_acts_from_its_file_as_it_was_trained(tmp_path):
+    rng = np.random.default_rng(1)
+    seen = rng.normal(size=(STEPS, ENVS, OBS)).astype(np.float32)
+    starts = (rng.random((STEPS, ENVS)) < 0.2).astype(np.float32)
+    policy = make_model(FastRecurrentPolicy, policy_kwargs={"mirror": MIRROR}).policy
+    wanted, _ = run_through(policy, seen, starts)
+    policies.save(tmp_path / "policy", policy, {})
+    loaded, state = policies.load(tmp_path / "policy"), None
+    for row, start, action in zip(seen, starts, wanted, strict=True):
+        given, state = loaded.predict(row, state, start)
+        np.testing.assert_allclose(given, action.clamp(-2.0, 2.0), atol=1e-6)
+    assert state[0].shape == (1, ENVS, 2 * HIDDEN)
+    with pytest.raises(ValueError, match=rf"it must be two of \(1, 5, {2 * HIDDEN}\)"):
+        loaded.predict(seen[0], (np.zeros((1, 5, HIDDEN)),) * 2)

@@ -17,7 +17,8 @@ import pytest
 from PIL import Image
 
 from tdgc.benchmark.diagnosis import Diagnosis
-from tdgc.benchmark.evaluation import CONDITIONS, Episode, write_results
+from tdgc.benchmark.evaluation import CONDITIONS, Episode
+from tdgc.benchmark.results import write_results
 from tdgc.show import report
 
 EVIL = "<script>alert('x')"  # a policy's name

@@ -307,7 +307,9 @@ def test_torques_speeds_accelerations_and_power() -> None:
 
 def test_table_and_configuration_name_the_same_terms() -> None:
     fields = {f.name for f in dataclasses.fields(LowRewardConfig)}
-    assert set(LOW_TERMS) | {"sigma_lin", "sigma_yaw", "terrain_penalty"} == fields
+    assert set(LOW_TERMS) | {
+        "sigma_lin", "sigma_yaw", "walking_penalty", "terrain_penalty",
+    } == fields  # fmt: skip
     assert all(LOW_TERMS[name].__name__ == name for name in LOW_TERMS)
     weights = LowRewardConfig()
     positive = {name for name in LOW_TERMS if getattr(weights, name) > 0.0}
@@ -360,7 +362,7 @@ def test_a_perfect_step_earns_the_most_there_is() -> None:
     step.state.derive()
     weights = LowRewardConfig(raibert_foothold=0.0)
     best = total(low_terms(step, weights), weights, 0.02)
-    np.testing.assert_allclose(best, [0.045, 0.045], atol=1e-12)
+    np.testing.assert_allclose(best, [0.07, 0.07], atol=1e-12)
 
 
 def test_desired_contact_of_a_trot_weighs_the_diagonal_in_swing() -> None:

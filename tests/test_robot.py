@@ -1,5 +1,6 @@
 """The robot's arithmetic against Bullet, and its URDF against what it says of itself."""
 
+import dataclasses
 import math
 import re
 import xml.etree.ElementTree as ElementTree
@@ -206,10 +207,21 @@ def test_joint_targets_scale_and_clip() -> None:
     actions = np.zeros((3, 12))
     actions[1], actions[2] = 2.0, -100.0
     pose = np.tile(nominal_pose(CONFIG), (3, 1))
-    moved = joint_targets(CONFIG, pose, actions) - pose
+    free = dataclasses.replace(CONFIG, joint_margin=None)
+    moved = joint_targets(free, GEOMETRY, pose, actions) - pose
     assert (moved[0] == 0.0).all()
     np.testing.assert_allclose(moved[1], np.tile([0.25, 0.5, 0.5], 4), atol=1e-12)
     np.testing.assert_allclose(moved[2], np.tile([-0.5, -1.0, -1.0], 4), atol=1e-12)
+
+
+def test_joint_targets_keep_from_the_limits() -> None:
+    """The calf's upper limit is -0.89 rad: at -1.5 and with 4 x 0.25 rad it is past it."""
+    pose, actions = nominal_pose(CONFIG)[None], np.full((1, 12), 4.0)
+    targets = joint_targets(CONFIG, GEOMETRY, pose, actions)[0].reshape(4, 3)
+    np.testing.assert_allclose(targets[:, 2], -0.89 - 0.02)
+    np.testing.assert_allclose(targets[:, 1], [1.8, 1.8, 2.0, 2.0])  # within its limits
+    free = dataclasses.replace(CONFIG, joint_margin=None)
+    assert joint_targets(free, GEOMETRY, pose, actions)[0, 2] == pytest.approx(-0.5)
 
 
 def commands(n: int, **changed: float) -> Array:

@@ -5,33 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.config import CommandRanges, PhysicsConfig, RobotConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.terrain import TileField, make_tile, trench_centres
-from tdgc.tasks.leaps import STANCE_LENGTH, STRIDE, straddling_frequency
-from tdgc.tasks.teacher import STYLES, Teacher, travel_cost, trenches
-
-
-@pytest.mark.parametrize(
-    ("level", "first"),
-    [(0, 2.1), (3, 2.125), (6, 2.1), (8, 2.125), (10, 2.1)],
-)
-def test_trenches_are_found_where_they_were_made(level: int, first: float) -> None:
-    """An odd number of lowered samples sits half a cell towards the start."""
-    expected = first + 1.25 * np.arange(4)
-    np.testing.assert_allclose(trench_centres(level / 10), expected)
-    heights = make_tile("gap", level / 10, np.random.default_rng(0)).heights
-    np.testing.assert_allclose(trenches(heights), expected)
-
-
-def test_no_trenches_on_steps() -> None:
-    assert trenches(make_tile("stair", 1.0, np.random.default_rng(0)).heights).size == 0
+from tdgc.sim.terrain import Features, TileField, make_tile
+from tdgc.tasks.leaps import SWING_HEIGHT
+from tdgc.tasks.teacher import STYLES, Teacher, travel_cost
 
 
 def test_travel_cost_in_the_open_is_the_way_of_a_king() -> None:
     goal = np.array([7.0, 4.0])
-    cost, step, left = travel_cost(np.zeros((161, 81)), 2.0, goal)
+    cost, step, left = travel_cost(np.empty((0, 3)), 81, 2.0, goal)
     assert cost.shape == (81, 41) and step == 0.1 and left == 2.0
     assert cost[70, 20] == 0.0
     assert cost[10, 20] == pytest.approx(6.0)
@@ -40,9 +24,9 @@ def test_travel_cost_in_the_open_is_the_way_of_a_king() -> None:
 
 
 def test_travel_cost_leads_around_a_wall() -> None:
-    heights = np.zeros((161, 81))
-    heights[80:84, 20:] = 0.8  # all but a metre on the right, y from 2 to 3
-    cost, _, _ = travel_cost(heights, 2.0, np.array([7.0, 5.0]))
+    # All but a metre, on the right.
+    wall = np.array([[4.0, y, 0.2] for y in np.arange(3.1, 6.1, 0.1)])
+    cost, _, _ = travel_cost(wall, 81, 2.0, np.array([7.0, 5.0]))
     straight = 6.0
     assert straight + 1.0 < cost[10, 30] < straight + 5.0  # and not through it, at 30 a metre
 
@@ -58,7 +42,7 @@ class Course:
         self.origin = self.field.origin(np.arange(len(families)), 0)
         self.loco = Locomotion(len(families), RobotConfig(), PhysicsConfig(), self.field)
         self.goal = self.origin + [7.25, 4.0]
-        self.teacher = Teacher(self.field, families)
+        self.teacher = Teacher(self.field, families, CommandRanges())
 
     def put(self, x: float, y: float = 4.0, yaw: float = 0.0) -> None:
         m = len(self.origin)
@@ -91,7 +75,8 @@ def test_each_family_is_walked_in_its_style(course) -> None:
         style = STYLES[family]
         assert row[INDEX["vx"]] == pytest.approx(style.speed)
         assert row[INDEX["yaw_rate"]] == pytest.approx(0.0, abs=1e-9)
-        assert row[INDEX["swing_height"]] == style.swing_height
+        swing = SWING_HEIGHT if family == "gap" else style.swing_height
+        assert row[INDEX["swing_height"]] == swing
         assert row[INDEX["stance_width"]] == style.stance_width
         assert gait_index(row) == (1 if family == "gap" else 0)
     decoder = CommandDecoder()  # all of it can be said in actions
@@ -108,27 +93,25 @@ def test_turns_to_the_goal_and_slows_before_it(course) -> None:
     assert course.commands()[0, INDEX["vx"]] == pytest.approx(0.2)
 
 
-def test_leaps_are_timed_before_trenches_and_end_behind_them(course) -> None:
+def test_leaps_face_across_the_trenches_and_end_behind_them(course) -> None:
     course = course(["gap"])
-    course.put(1.7)
-    course.loco.world.state.heading_vel[:, 0] = 1.1
-    command = course.commands()
-    one = np.ones(1)
-    expected = straddling_frequency(
-        1.7 * one, 1.1 * one, 0 * one, STRIDE * one, STANCE_LENGTH * one, trench_centres(0.8)[None]
-    )
-    assert 2.0 < expected[0] < 4.0
-    assert command[0, INDEX["frequency"]] == pytest.approx(expected[0])
-    course.put(6.45)  # the last trench is at 5.875
+    course.goal[:, 1] += 0.8
+    course.put(1.2, yaw=0.2)
+    command = course.commands()[0]
+    bearing = np.arctan2(0.8, 7.25 - 1.2)
+    assert gait_index(command) == 1
+    assert command[INDEX["vx"]] == pytest.approx(np.cos(bearing))
+    assert command[INDEX["vy"]] == pytest.approx(np.sin(bearing))
+    assert command[INDEX["yaw_rate"]] == pytest.approx(-0.3)
+    course.put(course.field.features[0, 0].trenches[-1, 1] + 0.55)
     command = course.commands()
     assert gait_index(command[0]) == 0 and command[0, INDEX["frequency"]] == 3.0
 
 
 def test_goes_around_a_pillar(course) -> None:
     course = course(["pillar"])
-    heights = course.field.heights
-    heights[:] = 0.0
-    heights[58:64, 78:90] = 0.8  # x 2.9-3.2, y 3.9-4.5: more of it on the left
+    # More of it on the left.
+    course.field.features[0, 0] = Features(pillars=np.array([[3.05, 4.15, 0.4]]))
     course.teacher.begin(np.arange(1), course.goal)
     course.put(2.3)
     assert course.commands()[0, INDEX["yaw_rate"]] < -0.5
@@ -141,4 +124,4 @@ def test_a_family_without_a_style_is_refused() -> None:
         ValueError,
         match=r"does not know mixed, only rough, .*; imitation\.steps=0 does without it$",
     ):
-        Teacher(TileField((1, 1)), ["mixed"])
+        Teacher(TileField((1, 1)), ["mixed"], CommandRanges())

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from test_drivers import save_high
+from test_drivers import CONFIG, save_high
 from test_evaluation import SMALL
 
 import evaluate
@@ -20,13 +20,14 @@ from tdgc.benchmark import evaluation, trace
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Cell, Episode, run_cell
 from tdgc.benchmark.trace import COLUMNS, Selection, Trace, TraceError, Tracer
-from tdgc.config import CommandRanges, HighRewardConfig
+from tdgc.config import HighRewardConfig
 from tdgc.sim.commands import CONTINUOUS, INDEX, NAMES, CommandDecoder
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
-from tdgc.tasks.high_env import PRETRAINED, height_probes, load_low
+from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.probes import height_probes
 
 ROOT = Path(__file__).resolve().parents[1]
 HOLD = 5  # control steps a decision
@@ -109,7 +110,7 @@ def test_a_row_a_decision_and_one_for_the_end(watched):
 
 def test_decisions_are_those_of_the_policy_and_what_they_decode_to(watched):
     notes, traces, _ = watched
-    decoder = CommandDecoder()
+    decoder = CommandDecoder(CONFIG.commands)
     for k, t in enumerate(traces):
         actions = np.stack([t[f"action_{name}"] for name in (*CONTINUOUS, "gait")], axis=1)
         commands = np.stack([t[f"command_{name}"] for name in NAMES], axis=1)
@@ -130,8 +131,7 @@ def test_commands_at_their_bounds_are_marked(low):
 
     _, (t,), _ = watch(Extreme(), Cell("gp", "nominal", "rough", 0, 0, 1), low[0])
     marked = {name: set(t[f"at_bound_{name}"][:-1].tolist()) for name in CONTINUOUS}
-    # The last two are so by default: feet as high as they go, power for nothing.
-    ends = {"vx": {1.0}, "vy": {-1.0}, "swing_height": {1.0}, "power_weight": {-1.0}}
+    ends = {"vx": {1.0}, "vy": {-1.0}, "power_weight": {-1.0}}  # the last by default
     assert {name: marked.pop(name) for name in ends} == ends
     del marked["yaw_rate"]  # whatever the goal asks
     assert set().union(*marked.values()) == {0.0}
@@ -188,8 +188,7 @@ def test_reward_terms_are_those_of_the_paper(watched):
     """From the other columns by the formulas of Sec. IV-B."""
     notes, traces, _ = watched
     c, dt = HighRewardConfig(), 0.1
-    low = np.array(dataclasses.astuple(CommandRanges()))[:, 0]
-    high = np.array(dataclasses.astuple(CommandRanges()))[:, 1]
+    low, high = np.array(dataclasses.astuple(CONFIG.commands)).T
     for k, t in enumerate(traces):
         p = np.clip(1.0 - t["goal_distance"][1:] / 8.0, 0.0, 1.0)
         expected = c.goal_distance * dt * (p + 1.0 - np.exp(-3.0 * p))
@@ -223,7 +222,6 @@ def test_the_baseline_has_no_actions_and_no_cues(low):
         assert set(t["family"]) == {None}
         assert set(t["gait"][:-1]) == {"trot"}
         assert t["command_vx"][0] == pytest.approx(notes.seen[1]["command"][k, 0])
-        assert np.array_equal(t["at_bound_swing_height"][:-1], np.ones(11))
         assert np.array_equal(t["at_bound_frequency"][:-1], np.zeros(11))
 
 
@@ -231,8 +229,8 @@ def test_robots_that_end_early_have_short_traces(low):
     """Two robots whose motors are dead fall while the third goes on; each has its own time."""
 
     class Limp(BaselineDriver):
-        def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
-            super().begin(loco, goal, family)
+        def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
+            super().begin(loco, goal, *told)
             loco.world.strength[:2] = 0.0
 
     _, traces, episodes = watch(Limp(), Cell("gp", "nominal", "rough", 0, 0, 3), low[0])

@@ -24,8 +24,15 @@ from stable_baselines3 import PPO
 
 import train_high
 import train_low
-from tdgc import policies
-from tdgc.config import LowTrainConfig, PPOConfig, from_dict, to_dict, with_overrides
+from tdgc import calibration, policies
+from tdgc.config import (
+    CalibrationConfig,
+    LowTrainConfig,
+    PPOConfig,
+    from_dict,
+    to_dict,
+    with_overrides,
+)
 from tdgc.learn.training import (
     CheckpointError,
     Interruption,
@@ -276,10 +283,11 @@ def test_the_policy_is_symmetric(tmp_path: Path) -> None:
 
 TINY = [
     "--seed", "3", "--n-envs", "4", "--workers", "2", "--steps", "160",
-    "--set", "plane_steps=64", "--set", "checkpoint_seconds=0", "--set", "log_steps=64",
+    "--set", "calibration.robots=0", "--set", "checkpoint_seconds=0", "--set", "log_steps=64",
     "--set", "ppo.n_steps=8", "--set", "ppo.batch_size=16", "--set", "ppo.n_epochs=2",
     "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.4",
     "--set", "env.physics.substeps=4", "--set", "plane_share=0.5",
+    "--set", 'env.families=["stair","gap"]',
 ]  # fmt: skip
 
 
@@ -337,20 +345,20 @@ def rows(run: Path) -> list[dict[str, Any]]:
 def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Two updates on the plane and three with half of the robots on tiles, in the middle of
-    episodes. The first run writes no checkpoint on its way. The second is stopped after the first
-    update, killed on tiles, loses its newest checkpoint, and goes on from the one before."""
+    """Five updates with half of the robots on tiles, in the middle of episodes. The first run
+    writes no checkpoint on its way. The second is stopped after the first update, killed, loses its
+    newest checkpoint, and goes on from the one before."""
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert train_low.main([*TINY, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     names = sorted(path.name for path in (whole / "checkpoints").iterdir())
-    assert names == ["step-000000000064", "step-000000000160"]  # the ends of both phases
+    assert names == ["step-000000000160"]
     assert [row["steps"] for row in rows(whole)] == [64, 128]
     assert all(row["memory/mb"] > 100.0 for row in rows(whole))
     assert rows(whole)[1]["reward/track_lin_vel"] > 0.0 and "level/stair" in rows(whole)[1]
     stored = from_dict(LowTrainConfig, json.loads((whole / "config.json").read_text()))
     expected = LowTrainConfig(
-        seed=3, n_envs=4, workers=2, steps=160, plane_steps=64, plane_share=0.5,
-        checkpoint_seconds=1e6, log_steps=64,
+        seed=3, n_envs=4, workers=2, steps=160, plane_share=0.5,
+        checkpoint_seconds=1e6, log_steps=64, calibration=CalibrationConfig(robots=0),
     )  # fmt: skip
     assert dataclasses.replace(stored, env=expected.env, ppo=expected.ppo) == expected
     assert stored.ppo.actor == (8,) and stored.env.episode_seconds == 0.4
@@ -417,44 +425,31 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert final(broken) == final(whole)
 
 
-def test_levels_go_on_into_the_next_phase(tmp_path: Path) -> None:
-    """Episodes do not. An update on tiles is too short for a level to fall by more than one."""
-    assert train_low.main([*TINY, "--steps", "64", "--out", str(tmp_path)]) == 0
-    tensors, header = read_checkpoint(newest(tmp_path))
-    for state in workers_of(tensors, header):  # views of the tensors
-        for part in state["tasks"]:
-            part["level"][:], part["command_share"][:] = 8, 0.9
-    save_checkpoint(tmp_path / "checkpoints", tensors, header)
-    assert train_low.main(["--resume", "--steps", "96", "--out", str(tmp_path)]) == 0
-    for state in workers_of(*read_checkpoint(newest(tmp_path))):
-        for part in state["tasks"]:
-            assert (part["level"] >= 7).all() and (part["command_share"] >= 0.9).all()
-        assert state["lengths"].max() == 8
+def test_calibration_ends_a_run_of_the_low_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Its copy takes the policy's place. One that is interrupted ends the same when it goes on."""
+    monkeypatch.setattr(calibration, "_EPOCHS", 2)
+    monkeypatch.setattr(calibration, "_CORRECTIONS", 4)
+    arguments = [*TINY, "--steps", "32", "--set", "calibration.robots=64"]
+    arguments += ["--set", "calibration.turns=1"]
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    assert train_low.main([*arguments, "--out", str(whole)]) == 0
+    learned, given = policies.load(whole / "uncalibrated"), policies.load(whole / "policy")
+    assert given.meta["calibration"]["robots"] == 64 and "calibration" not in learned.meta
+    assert given.meta["benchmark"] == learned.meta["benchmark"] == 2
+    assert weights(whole) != (whole / "uncalibrated.safetensors").read_bytes()
 
+    def stop(call: int, interruption: Interruption) -> None:
+        interruption.reason = "the test" if call == 4 else None
 
-def test_a_run_of_version_1_goes_on(tmp_path: Path) -> None:
-    """Its checkpoints have no episodes and lists for arrays, its configuration counts steps."""
-    arguments = [*TINY, "--steps", "64", "--set", "plane_steps=0", "--set", "plane_share=0"]
-    assert train_low.main([*arguments, "--out", str(tmp_path)]) == 0
-    tensors, header = read_checkpoint(newest(tmp_path))
-    states = workers_of(tensors, header)
-    header |= {"version": 1, "workers": [
-        {
-            **{key: state[key] for key in ("rng", "tiles_drawn", "restarts")},
-            "level": [7, 8], "command_share": state["command_share"].tolist(),
-        }
-        for state in states
-    ]}  # fmt: skip
-    tensors = {k: v for k, v in tensors.items() if not k.startswith("extra.")}
-    save_checkpoint(tmp_path / "checkpoints", tensors, header)
-    assert train_low.main(["--resume", "--steps", "96", "--out", str(tmp_path)]) == 0
-    tensors, header = read_checkpoint(newest(tmp_path))
-    assert (header["num_timesteps"], header["version"]) == (96, 3)
-    after = workers_of(tensors, header)
-    assert all(np.abs(state["level"] - [7, 8]).max() <= 1 for state in after)
-    assert [s["tiles_drawn"] > t["tiles_drawn"] for s, t in zip(after, states, strict=True)] == [
-        True, True
-    ]  # fmt: skip
+    with monkeypatch.context() as patch:
+        at_calls(patch, stop)
+        assert train_low.main([*arguments, "--out", str(broken)]) == 0
+    assert "stopped by the test" in "".join(capfd.readouterr())
+    assert weights(broken) == (whole / "uncalibrated.safetensors").read_bytes()
+    assert train_low.main(["--resume", "--out", str(broken)]) == 0
+    assert weights(broken) == weights(whole)
 
 
 def test_faults_of_a_run(
@@ -463,7 +458,7 @@ def test_faults_of_a_run(
     """A full disk, a killed worker, a stop; then workers that are killed again and again."""
     arguments = [
         *TINY, "--n-envs", "2", "--workers", "1", "--steps", "160", "--out", str(tmp_path),
-        "--set", "plane_steps=1000", "--set", "checkpoint_seconds=0", "--set", "log_steps=16",
+        "--set", "checkpoint_seconds=0", "--set", "log_steps=16",
     ]  # fmt: skip
     full = contextlib.ExitStack()
 
@@ -572,17 +567,15 @@ def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert workers("--resume", "--workers", "5") == 5
 
 
-def test_phases_of_a_run() -> None:
-    """The plane with its coarser step, then tiles with the full number of substeps."""
-    config = with_overrides(LowTrainConfig(), ["plane_steps=100", "steps=80"])
-    assert [phase.until for phase in train_low.phases(config, "cpu")] == [80, 80]
-    config = with_overrides(LowTrainConfig(), ["plane_steps=100", "steps=300"])
-    plane, tiles = train_low.phases(config, "cpu")
-    assert (plane.until, tiles.until) == (100, 300)
-    _, (first, on_plane), device = plane.build.args  # type: ignore[attr-defined]
-    _, (second, on_tiles), _ = tiles.build.args  # type: ignore[attr-defined]
-    assert first == second == on_plane  # of those that stay there
+def test_robots_of_a_run() -> None:
+    """Some on a plane, whose physics step is as long as a torque is held, the others on tiles."""
+    config = with_overrides(LowTrainConfig(), ["steps=80"])
+    (phase,) = train_low.phases(config, "cpu")
+    assert phase.until == 80
+    _, (on_plane, on_tiles), device = phase.build.args  # type: ignore[attr-defined]
     assert (on_plane.terrain, on_plane.physics.substeps, device) == ("plane", 4, "cpu")
+    assert on_plane.physics.hold == 1 and on_plane.physics.joint_steps == 4
     assert (on_tiles.terrain, on_tiles.physics) == ("tiles", config.env.physics)
+    assert on_tiles.physics.joint_steps == 4
     assert dataclasses.replace(on_plane, terrain="tiles", physics=on_tiles.physics) == on_tiles
     assert PPOConfig().mirror

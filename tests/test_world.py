@@ -18,7 +18,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import ALL_FAMILIES, HEIGHT_RANGE, TileField, make_tile, tile_rng
 from tdgc.sim.world import CLIENT_ROBOTS, World
-from tdgc.tasks.low_env import is_fallen
+from tdgc.tasks.rules import is_fallen
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()
 GEOMETRY, NOMINAL = read_geometry(ROBOT), nominal_pose(ROBOT)
@@ -182,12 +182,12 @@ def test_fields_that_do_not_fit() -> None:
         World(10, ROBOT, PHYSICS, TileField((10, 9)))
     field = TileField((1, 1), crop=2.9)
     field.heights[5, 5] = HEIGHT_RANGE[1] + 0.01
-    with pytest.raises(ValueError, match=r"^heights 0\.00\.\.2\.11 m leave \(-2\.1, 2\.1\) m$"):
+    with pytest.raises(ValueError, match=r"^heights 0\.00\.\.2\.51 m leave \(-2\.5, 2\.5\) m$"):
         World(1, ROBOT, PHYSICS, field)
     field.heights[5, 5] = 0.0
     world = World(1, ROBOT, PHYSICS, field)
-    field.heights[5, 5] = -2.2
-    with pytest.raises(ValueError, match=r"^heights -2.20"):
+    field.heights[5, 5] = -2.6
+    with pytest.raises(ValueError, match=r"^heights -2.60"):
         world.upload_terrain()
     world.close()
 
@@ -255,24 +255,52 @@ def test_a_standing_robot_presses_with_its_weight(plane: World) -> None:
 
 @pytest.mark.parametrize("payload", [-1.0, 3.0])
 def test_payload_adds_its_weight(plane: World, payload: float) -> None:
-    plane.set_dynamics([0], np.array([0.8]), np.array([payload]))
-    hold(plane, 50)
+    plane.set_dynamics([0], np.array([0.8]), np.array([payload]), np.zeros(1))
+    hold(plane, 100)
     assert mean_foot_force(plane)[0].sum() == pytest.approx((MASS + payload) * G, rel=0.01)
     mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
     assert mass == pytest.approx(GEOMETRY.trunk_mass + payload)
     nominal = np.array([0.016147, 0.068159, 0.073013])
     np.testing.assert_allclose(inertia, nominal * mass / GEOMETRY.trunk_mass, rtol=1e-6)
     # Not on top of the last payload.
-    plane.set_dynamics([0], np.array([0.8]), np.array([0.0]))
+    plane.set_dynamics([0], np.array([0.8]), np.array([0.0]), np.zeros(1))
     mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
     assert mass == pytest.approx(GEOMETRY.trunk_mass)
     np.testing.assert_allclose(inertia, nominal, rtol=1e-6)
 
 
+def test_armature_is_inertia_about_the_joints(plane: World) -> None:
+    """Of each leg's links about the axis of their joint, and not on top of the last one."""
+    client, body = plane._client_of[0], plane._bodies[0]
+
+    def inertia() -> Array:
+        return np.array([client.getDynamicsInfo(body, joint)[2] for joint in plane._joints])
+
+    before = inertia()
+    for armature in (0.02, 0.01):
+        plane.set_dynamics([0], np.array([0.8]), np.zeros(1), np.array([armature]))
+    added = (inertia() - before).reshape(4, 3, 3)
+    # Hips turn about x, thighs and calves about y.
+    np.testing.assert_allclose(added, [0.01 * np.eye(3)[[0, 1, 1]]] * 4, atol=1e-9)
+
+
+def test_joint_friction_holds_a_joint_back(plane: World) -> None:
+    """A leg that is let go in the air swings less far with friction in its joints."""
+    swung = []
+    for friction in (0.0, 0.3):
+        put(plane, np.zeros(2), 5.0)
+        plane.strength[:], plane.joint_friction[:] = 0.0, friction
+        plane.state.qd[0] = 3.0
+        plane._put(0)
+        hold(plane, 5)
+        swung.append(np.abs(plane.state.q[0] - NOMINAL).mean())
+    assert swung[1] < 0.8 * swung[0] and swung[1] > 0.01
+
+
 @pytest.mark.parametrize("friction", [0.4, 0.8])
 def test_friction_slows_a_sliding_robot(plane: World, friction: float) -> None:
     """On its back and pushed at 1 m/s, the robot loses mu g of its speed each second."""
-    plane.set_dynamics([0], np.array([friction]), np.array([0.0]))
+    plane.set_dynamics([0], np.array([friction]), np.array([0.0]), np.zeros(1))
     plane.reset_robots([0], np.array([[0.0, 0.0, 0.056]]), UPSIDE_DOWN, NOMINAL[None])
     hold(plane, 15)
     assert np.linalg.norm(plane.state.lin_vel[0]) < 0.05
@@ -339,7 +367,9 @@ def test_motor_strength_scales_torque() -> None:
     world = World(2, ROBOT, PHYSICS)
     put(world, np.array([[0.0, 0.0], [3.0, 0.0]]), height=5.0)
     world.strength[1] = 0.5
-    world.physics = PhysicsConfig(control_dt=0.0025, substeps=1)  # the first physics step alone
+    world.physics = PhysicsConfig(
+        control_dt=0.0025, substeps=1, hold=1
+    )  # the first physics step alone
     hold(world, 1, NOMINAL + 0.2)
     np.testing.assert_allclose(world.state.torque[0], 4.0, atol=1e-9)  # 20 N m/rad
     np.testing.assert_allclose(world.state.torque[1], 2.0, atol=1e-9)
@@ -507,7 +537,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
     ground = world.ground_height(xy[:, 0], xy[:, 1])
     pose, upright = np.tile(NOMINAL, (m, 1)), yaw_quaternion(rng.uniform(-3, 3, m))
     world.reset_robots(np.arange(m), np.column_stack([xy, ground + STAND + 0.1]), upright, pose)
-    world.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0))
+    world.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0), np.full(m, 0.01))
 
     def stumble(worlds: list[World], steps: int) -> bool:
         """Whether all of them do the same."""
@@ -521,7 +551,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
 
     def anew() -> World:
         other = World(m, ROBOT, PHYSICS, field)
-        other.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0))
+        other.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0), np.full(m, 0.01))
         for name in ("position", "quaternion", "lin_vel", "ang_vel", "q", "qd"):
             getattr(other.state, name)[:] = getattr(world.state, name)
         other.state.derive()

@@ -22,8 +22,10 @@ from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
-from tdgc.tasks.high_env import SEMANTIC, check_pair, high_layout, observe_high
+from tdgc.sim.sensors import Noise
+from tdgc.tasks.high_env import SEMANTIC, high_layout, observe_high, paired
 from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.probes import HeightProbes
 from tdgc.tasks.teacher import Teacher, toward
 
 
@@ -40,8 +42,15 @@ class Driver(Protocol):
     bounds: CommandRanges
     action: NDArray[np.floating] | None
 
-    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
-        """New episodes for all robots of ``loco``; ``goal`` (M, 2) m in the world."""
+    def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
+        """New episodes for all robots of ``loco``.
+
+        Args:
+            loco: M robots at their starts.
+            goal: (M, 2) m in the world.
+            family: that the semantic cue names, "unknown" where it names none.
+            noise: of the height probes; None for exact ones.
+        """
 
     def command(self, step: int) -> Array:
         """Commands (M, 15) for the coming control step number ``step``."""
@@ -78,7 +87,7 @@ class BaselineDriver:
         self.bounds = CommandRanges()
         self.action: NDArray[np.floating] | None = None
 
-    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+    def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
         self._command = np.tile(default_command(), (loco.num_robots, 1))
         self._command[:, INDEX["swing_height"]] = self.law.swing_height
@@ -103,14 +112,14 @@ class TeacherDriver:
     def __init__(self, low: Policy, config: LowLevelConfig) -> None:
         self.config = HighLevelConfig(cues="none")
         self._landing = measure_landing(low, config)
-        self.bounds = CommandRanges()
+        self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
 
-    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+    def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
         assert loco.world.field is not None  # episodes run on tiles
         families = [family] * loco.num_robots
-        self._teacher = Teacher(loco.world.field, families, self._landing)
+        self._teacher = Teacher(loco.world.field, families, self.bounds, self._landing)
         self._teacher.begin(np.arange(loco.num_robots), goal)
 
     def command(self, step: int) -> Array:
@@ -130,11 +139,12 @@ class HierarchyDriver:
 
     def __init__(self, high: Policy, config: HighLevelConfig) -> None:
         self._high, self.config = high, config
+        assert config.commands is not None  # filled in by ``load_high``
         self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
         self._decoder = CommandDecoder(config.commands, config.action_limit)
 
-    def begin(self, loco: Locomotion, goal: Array, family: str) -> None:
+    def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         m, config = loco.num_robots, self.config
         self._loco, self._goal = loco, goal
         seen = SEMANTIC.index(family if family in SEMANTIC else "unknown")
@@ -142,12 +152,16 @@ class HierarchyDriver:
         self._horizon = round(
             config.episode_seconds / (config.decimation * loco.physics.control_dt)
         )
+        self._probes = HeightProbes(loco, noise)
+        self._probes.begin(np.arange(m))
         self._state: policies.State | None = None
         self._last = np.zeros((m, NUM_ACTIONS))
 
     def command(self, step: int) -> Array:
         decision, held = divmod(step, self.config.decimation)
         if held == 0:
+            if decision > 0:
+                self._probes.measure()
             observation = observe_high(
                 self._loco,
                 self._goal,
@@ -155,6 +169,7 @@ class HierarchyDriver:
                 self._last,
                 self._families,
                 self.config.cues,
+                self._probes.read(),
             )
             action, self._state = self._high.predict(observation, self._state)
             self.action, self._last = action, self._decoder.normalise(action)
@@ -199,5 +214,4 @@ def load_high(
     ):
         if wanted != given:
             raise ConfigError(f"{path}: trained for {what.format(wanted)}, not {given}")
-    check_pair(config, low_config)
-    return high, config
+    return high, paired(config, low_config)

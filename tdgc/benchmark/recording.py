@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import OUTCOMES, Cell, EpisodeRecord, Watcher
+from tdgc.benchmark.evaluation import Cell, EpisodeRecord, Watcher
 from tdgc.config import RobotConfig
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
 from tdgc.tasks.rewards import CONTACT_FORCE
+from tdgc.tasks.rules import OUTCOMES
 
 
 @dataclass(frozen=True, eq=False)

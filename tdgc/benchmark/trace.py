@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import OUTCOMES, Cell, EpisodeRecord, joint_power
+from tdgc.benchmark.evaluation import Cell, EpisodeRecord, joint_power
 from tdgc.config import CommandRanges
 from tdgc.errors import InputError, install_hint
 from tdgc.sim.commands import (
@@ -39,8 +39,10 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import TileField
 from tdgc.tasks import rewards
-from tdgc.tasks.high_env import PROBES, SEMANTIC, command_share, height_probes, high_step
+from tdgc.tasks.high_env import SEMANTIC, command_share, high_step
+from tdgc.tasks.probes import PROBES, height_probes
 from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
+from tdgc.tasks.rules import OUTCOMES
 
 FORMAT = "tdgc-trace"
 VERSION = 1

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import HierarchyDriver
-from tdgc.benchmark.evaluation import Episode, success
+from tdgc.benchmark.evaluation import Episode
+from tdgc.benchmark.results import success
 from tdgc.config import (
     CommandRanges,
     ConfigError,

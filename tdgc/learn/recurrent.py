@@ -23,22 +23,28 @@ from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.common.recurrent.type_aliases import RecurrentRolloutBufferSamples, RNNStates
 from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.torch_layers import MlpExtractor
 from torch import nn
+
+from tdgc.policies.files import Mirror
+from tdgc.policies.learning import MirroredHead, MirroredLSTM, MirroredMlpExtractor
 
 
 class FastRecurrentPolicy(RecurrentActorCriticPolicy):
     """``MlpLstmPolicy`` with a fast ``evaluate_actions``; for ``FastRecurrentPPO``.
 
-    It takes the same arguments, has the same parameters and computes the same numbers.
+    It takes the same arguments, has the same parameters and computes the same numbers; with a
+    ``mirror`` it is exactly left-right symmetric, and so is its value.
 
     Raises:
         ValueError: other LSTMs than plain ones of one layer, one each for actor and critic, or
             other actions than normally distributed ones with one deviation each.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, mirror: Mirror | None = None, **kwargs: Any) -> None:
         # SB3's Adam, in one operation instead of a dozen for each parameter.
         kwargs.setdefault("optimizer_kwargs", {"eps": 1e-5, "fused": True})
+        self.mirror = mirror
         super().__init__(*args, **kwargs)
         plain = self.lstm_actor.num_layers == 1 and not self.lstm_kwargs
         if self.lstm_critic is None or not plain or not self.share_features_extractor:
@@ -48,6 +54,21 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
             )
         if not isinstance(self.action_dist, DiagGaussianDistribution):
             raise ValueError("FastRecurrentPolicy has normally distributed actions, without gSDE")
+        if mirror is not None:  # the parameters stay, so the optimiser has them
+            self.lstm_actor = MirroredLSTM(self.lstm_actor, mirror)  # type: ignore[assignment]
+            self.lstm_critic = MirroredLSTM(self.lstm_critic, mirror)  # type: ignore[assignment]
+            self.lstm_hidden_state_shape = (1, 1, self.lstm_actor.hidden_size)
+            self.action_net = MirroredHead(cast(nn.Linear, self.action_net), mirror)
+            self.value_net = MirroredHead(self.value_net, None)  # type: ignore[assignment]
+
+    def _build_mlp_extractor(self) -> None:
+        kind = MlpExtractor if self.mirror is None else MirroredMlpExtractor
+        self.mlp_extractor = kind(
+            self.lstm_output_dim, self.net_arch, self.activation_fn, self.device
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "mirror": self.mirror}
 
     def evaluate_actions(  # type: ignore[override]  # as sb3-contrib has it
         self, obs: th.Tensor, actions: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor

@@ -49,9 +49,6 @@ from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
 _VERSION = 3
-#: Version 1 has no episodes under way: its runs go on with new ones. The checksum of 1 and 2 is of
-#: the tensors alone.
-_READABLE = (1, 2, 3)
 #: Names of what the recurrent learner remembers of the episodes under way.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
@@ -113,11 +110,8 @@ def snapshot(
 
 def _checksum(data: bytes, header: dict[str, Any]) -> str:
     """Of the tensors' file and of all that stands beside it in the header."""
-    digest = hashlib.sha256(data)
-    if header["version"] >= 3:
-        rest = {key: value for key, value in header.items() if key != "sha256"}
-        digest.update(json.dumps(rest, sort_keys=True).encode())
-    return digest.hexdigest()
+    rest = {key: value for key, value in header.items() if key != "sha256"}
+    return hashlib.sha256(data + json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, th.Tensor], header: dict[str, Any]) -> Path:
@@ -159,9 +153,8 @@ def read_checkpoint(path: Path) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
         data = (path / "state.safetensors").read_bytes()
         header = json.loads((path / "state.json").read_bytes())
         known = isinstance(header, dict) and header.get("format") == "tdgc-checkpoint"
-        if not known or header.get("version") not in _READABLE:
-            versions = " or ".join(map(str, _READABLE))
-            raise CheckpointError(f"{path}: not a tdgc checkpoint of version {versions}")
+        if not known or header.get("version") != _VERSION:
+            raise CheckpointError(f"{path}: not a tdgc checkpoint of version {_VERSION}")
         for counter in ("num_timesteps", "n_updates"):
             if type(header.get(counter)) is not int or not 0 <= header[counter] < 2**63:
                 raise CheckpointError(f"{path}: '{counter}' is no count")
@@ -251,6 +244,10 @@ class Interruption:
                 self.reason = "the time limit"
         return self.reason is not None
 
+    def tell(self, run: Path) -> None:
+        """Say what stopped the run in the folder ``run``, and how it goes on."""
+        tqdm.write(f"stopped by {self.reason}; --resume --out {run} goes on")
+
 
 class RunCallback(BaseCallback):
     """Progress, logs and checkpoints of a run.
@@ -281,13 +278,14 @@ class RunCallback(BaseCallback):
         total_steps: int,
         seconds_before: float = 0.0,
         phase: int = 0,
+        name: str | None = None,
     ) -> None:
         super().__init__()
         self.run, self.env, self.meta = run, env, meta
         self.summarise, self.interruption = summarise, interruption
         self.log_steps, self.checkpoint_seconds = log_steps, checkpoint_seconds
         self.total_steps = total_steps
-        self.phase = phase
+        self.phase, self._name = phase, name
         self._started = time.monotonic() - seconds_before
         self._saved_at = 0.0
         self._logged_at = (0, 0.0)
@@ -305,6 +303,7 @@ class RunCallback(BaseCallback):
         self._saved_at = self.seconds
         self._logged_at = (self.num_timesteps, self.seconds)
         self._bar = tqdm(
+            desc=self._name,
             total=self.total_steps,
             initial=self.num_timesteps,
             unit="step",
@@ -477,10 +476,12 @@ class Phase:
     """A stretch of a run with its own environment.
 
     Attributes:
+        name: for the progress bar.
         build: makes the learner and its workers, given their ``timeout`` and what starts one.
         until: steps of the run at which the phase ends.
     """
 
+    name: str
     build: Callable[[float, MakeLink], tuple[Any, TaskVecEnv]]
     until: int
 
@@ -523,7 +524,13 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     if args.resume:
         if not stored.is_file():
             raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
-        config = recorded(type(config), read_json(stored), stored)
+        try:
+            config = recorded(type(config), read_json(stored), stored)
+        except ConfigError as error:
+            raise ConfigError(
+                f"{error}; a run of another version cannot go on: start one in another folder, "
+                f"with --init {args.out / 'policy'} to begin from its policy"
+            ) from error
     elif stored.exists():
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
@@ -545,6 +552,7 @@ def run(
     phases: Sequence[Phase],
     meta: dict[str, Any],
     summarise: Callable[[dict[str, float]], dict[str, float]],
+    interruption: Interruption,
 ) -> bool:
     """Train through the phases, or go on with them; False when interrupted.
 
@@ -554,6 +562,7 @@ def run(
         phases: in order.
         meta: goes into the policy's file.
         summarise: sums of all workers -> values to log.
+        interruption: when to stop.
 
     Raises:
         CheckpointError: nothing to resume that can be read.
@@ -566,7 +575,6 @@ def run(
         policies.load(args.init)  # before anything is written
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "config.json").write_text(json.dumps(to_dict(config), indent=2), encoding="utf-8")
-    interruption = Interruption(args.time_limit)
     link: MakeLink = ProcessLink if args.cluster is None else ActorLink
     seconds = float(carried[1]["seconds"]) if carried else 0.0
     finished, unsaved = True, None
@@ -578,7 +586,7 @@ def run(
             model.set_logger(tensorboard_logger(args.out / "tensorboard"))
             callback = RunCallback(
                 args.out, env, meta, summarise, interruption, config.log_steps,
-                config.checkpoint_seconds, config.steps, seconds, number,
+                config.checkpoint_seconds, config.steps, seconds, number, phase.name,
             )  # fmt: skip
             if carried is not None:
                 load_learner(model, *carried)
@@ -607,5 +615,5 @@ def run(
     if unsaved is not None:
         raise unsaved
     if not finished:
-        tqdm.write(f"stopped by {interruption.reason}; --resume --out {args.out} goes on")
+        interruption.tell(args.out)
     return finished

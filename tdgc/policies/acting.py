@@ -27,7 +27,8 @@ _FUNCTIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
 class Actor(nn.Module):
     """The mean action, before it is clipped, after the LSTM if any: (n, inputs) -> (n, actions).
 
-    With a mirror it is exactly symmetric, as with ``MirroredHead``.
+    With a mirror it is exactly symmetric, as with ``MirroredHead``; what it takes from an LSTM are
+    then the latents of both sides, (2n, inputs).
     """
 
     def __init__(self, header: Header, tensors: Mapping[str, th.Tensor]) -> None:
@@ -39,18 +40,26 @@ class Actor(nn.Module):
             layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
             layer.load_state_dict({"weight": weight, "bias": bias}, assign=True)
             self.layers.append(layer.requires_grad_(False))
+        self.recurrent = header.lstm is not None
         self.mirror: tuple[th.Tensor, ...] | None = None
         if header.mirror is not None:
             self.mirror = tuple(th.tensor(part) for part in dataclasses.astuple(header.mirror))
 
+    def both_sides(self, x: th.Tensor) -> th.Tensor:
+        """Observations (n, size) and behind them their mirror images, (2n, size)."""
+        if self.mirror is None:
+            return x
+        obs_index, obs_sign, _, _ = self.mirror
+        return th.cat([x, x[:, obs_index] * obs_sign])
+
     def forward(self, x: th.Tensor) -> th.Tensor:
-        if self.mirror is not None:
-            obs_index, obs_sign, action_index, action_sign = self.mirror
-            x = th.cat([x, x[:, obs_index] * obs_sign])
+        # A recurrent policy's LSTM has seen both sides already.
+        x = x if self.recurrent else self.both_sides(x)
         for layer in self.layers[:-1]:
             x = self.activation(layer(x))
         x = self.layers[-1](x)
         if self.mirror is not None:
+            _, _, action_index, action_sign = self.mirror
             seen, mirrored = x.chunk(2)
             x = 0.5 * (seen + mirrored[:, action_index] * action_sign)
         return x
@@ -85,7 +94,8 @@ class Policy:
         self.low: Array = np.array(header.low, dtype=np.float32)
         self.high: Array = np.array(header.high, dtype=np.float32)
         self.tensors = tensors
-        self._hidden = header.lstm
+        sides = 1 if header.mirror is None else 2
+        self._hidden = header.lstm and sides * header.lstm
         self.actor = Actor(header, tensors)
         self._lstm = [tensors[f"actor_lstm.{t}"] for t in LSTM_TENSORS] if header.lstm else []
         log_std = tensors["log_std"].numpy()
@@ -111,7 +121,7 @@ class Policy:
             obs: (n, d) or (d,), where d is ``actor_dim`` or ``obs_dim``; of the latter only the
                 actor part is used.
             state: (h, c), each (1, n, hidden), as returned before; None for zeros. For "mlp" it
-                is handed back as it came.
+                is handed back as it came. With a mirror ``hidden`` is twice the LSTM's size.
             episode_start: (n,) or a scalar, true where the state is to be zeroed first.
             deterministic: the mean action, or else one drawn from the Gaussian.
 
@@ -132,15 +142,30 @@ class Policy:
         with one_thread(), th.inference_mode():
             latent = th.from_numpy(batch)
             if self._hidden is not None:
-                h, c = self._previous(state, episode_start, len(batch), self._hidden)
-                h, c = th.lstm_cell(latent, (h, c), *self._lstm)
-                latent, state = h, (h.numpy()[None], c.numpy()[None])
+                before = self._previous(state, episode_start, len(batch), self._hidden)
+                latent, after = self.remember(latent, before)
+                state = (after[0].numpy()[None], after[1].numpy()[None])
             actions: Array = self.actor(latent).numpy()
         if not deterministic:
             noise = self._rng.standard_normal(actions.shape, dtype=np.float32)
             actions = actions + self._std * noise
         actions = np.clip(actions, self.low, self.high)
         return (actions if x.ndim == 2 else actions[0]), state
+
+    def remember(
+        self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
+    ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
+        """One step of the LSTM: (n, inputs) and two (n, hidden) -> latents for the actor, two.
+
+        With a mirror ``hidden`` is twice the LSTM's size: first the side that is seen, then its
+        mirror image.
+        """
+        if self.actor.mirror is None:
+            h, c = th.lstm_cell(x, state, *self._lstm)
+            return h, (h, c)
+        h, c = (th.cat(part.chunk(2, dim=-1)) for part in state)
+        h, c = th.lstm_cell(self.actor.both_sides(x), (h, c), *self._lstm)
+        return h, (th.cat(h.chunk(2), dim=-1), th.cat(c.chunk(2), dim=-1))
 
     @staticmethod
     def _previous(

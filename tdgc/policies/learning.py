@@ -99,6 +99,49 @@ class MirroredHead(nn.Module):
         return cast(th.Tensor, 0.5 * (seen + mirrored[..., index] * sign))
 
 
+class MirroredLSTM(nn.Module):
+    """An LSTM that sees an observation and its mirror image, in two halves of a wider state.
+
+    It is called as ``nn.LSTM`` is. ``MirroredMlpExtractor`` and ``MirroredHead`` go on with the
+    halves.
+
+    Attributes:
+        lstm: what both halves go through.
+        input_size, hidden_size, num_layers: as ``nn.LSTM`` has them, seen from outside.
+    """
+
+    def __init__(self, lstm: nn.LSTM, mirror: Mirror) -> None:
+        super().__init__()
+        self.lstm = lstm
+        self.input_size, self.num_layers = lstm.input_size, lstm.num_layers
+        self.hidden_size = 2 * lstm.hidden_size
+        self.register_buffer("index", th.tensor(mirror.obs_index), persistent=False)
+        self.register_buffer("sign", th.tensor(mirror.obs_sign), persistent=False)
+
+    def forward(
+        self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
+    ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
+        """(steps, n, input_size) and two (1, n, hidden_size) -> (steps, n, hidden_size), two."""
+        index, sign = cast(th.Tensor, self.index), cast(th.Tensor, self.sign)
+        both = th.cat([x, x[..., index] * sign], dim=1)
+        h, c = (th.cat(part.chunk(2, dim=-1), dim=1) for part in state)
+        latent, after = self.lstm(both, (h, c))
+        latent, h, c = (th.cat(part.chunk(2, dim=1), dim=-1) for part in (latent, *after))
+        return latent, (h, c)
+
+
+class MirroredMlpExtractor(MlpExtractor):
+    """SB3's, on each half of what ``MirroredLSTM`` gives."""
+
+    def forward_actor(self, features: th.Tensor) -> th.Tensor:
+        """(n, 2 feature_dim) -> (n, 2 latent_dim_pi)."""
+        return th.cat([self.policy_net(x) for x in features.chunk(2, dim=-1)], dim=-1)
+
+    def forward_critic(self, features: th.Tensor) -> th.Tensor:
+        """(n, 2 feature_dim) -> (n, 2 latent_dim_vf)."""
+        return th.cat([self.value_net(x) for x in features.chunk(2, dim=-1)], dim=-1)
+
+
 class AsymmetricActorCriticPolicy(ActorCriticPolicy):
     """SB3 policy for a Box observation laid out as [actor part | critic-only part].
 
@@ -231,7 +274,8 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
     plain = isinstance(policy.action_dist, DiagGaussianDistribution) and not policy.squash_output
     if type(policy.features_extractor) is not FlattenExtractor or not plain:
         raise ValueError("only policies on flat features with a plain Gaussian can be saved")
-    if type(policy.mlp_extractor) not in (MlpExtractor, AsymmetricMlpExtractor):
+    plain_nets = (MlpExtractor, AsymmetricMlpExtractor, MirroredMlpExtractor)
+    if type(policy.mlp_extractor) not in plain_nets:
         raise ValueError("only policies with a plain MLP for actor and critic can be saved")
     activations = [name for name, fn in ACTIVATIONS.items() if fn is policy.activation_fn]
     if not activations:
@@ -239,7 +283,7 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
 
     lstm = None
     if isinstance(policy, RecurrentActorCriticPolicy):
-        lstm = policy.lstm_actor.hidden_size
+        lstm = _inner(policy.lstm_actor).hidden_size
         if policy.lstm_critic is None or policy.lstm_kwargs or policy.lstm_actor.num_layers != 1:
             raise ValueError("only plain LSTMs of one layer, one each for actor and critic")
     tensors = _tensors(policy)
@@ -267,6 +311,10 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
     )
 
 
+def _inner(lstm: nn.LSTM | MirroredLSTM) -> nn.LSTM:
+    return lstm.lstm if isinstance(lstm, MirroredLSTM) else lstm
+
+
 def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
     """The live parameters of an SB3 policy under the names of the file."""
     extractor = policy.mlp_extractor
@@ -276,7 +324,7 @@ def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
         ("critic", extractor.value_net, policy.value_net),
     ):
         if isinstance(policy, RecurrentActorCriticPolicy):
-            lstm = getattr(policy, f"lstm_{net}")
+            lstm = _inner(getattr(policy, f"lstm_{net}"))
             for tensor in LSTM_TENSORS:
                 tensors[f"{net}_lstm.{tensor}"] = getattr(lstm, f"{tensor}_l0")
         head = output.linear if isinstance(output, MirroredHead) else output

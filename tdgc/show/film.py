@@ -31,7 +31,7 @@ from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TILE_SIZE, Tile, TileField, file_label
 from tdgc.sim.world import Stage
-from tdgc.tasks.low_env import GOAL_RADIUS
+from tdgc.tasks.rules import GOAL_RADIUS
 
 FRAME_SECONDS = 0.04  # 25 frames a second: every second control step
 ENDING_SECONDS = 1.0  # the last frame stays, so that the outcome can be read

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import OUTCOMES, Cell, low_config, run_cell, tile_of
+from tdgc.benchmark.evaluation import Cell, low_config, run_cell, tile_of
 from tdgc.policies import Policy
 from tdgc.show.film import field_of, set_stage
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, CommandDecoder, default_command, gait_index
@@ -21,7 +21,8 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
 from tdgc.sim.world import Stage, WindowError
-from tdgc.tasks.low_env import is_fallen
+from tdgc.tasks.executor import Executor
+from tdgc.tasks.rules import GOING, OUTCOMES, outcome
 
 MODES = ("drive", "watch")
 _TEXT_SECONDS = 0.1  # between two texts, a decision's length: more often cannot be read
@@ -83,6 +84,7 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
     config, tile = low_config(low), tile_of(seed, cell.family, cell.level, cell.first)
     stage, field = set_stage(tile, config.robot, window=True), field_of(tile)
     loco = Locomotion(1, config.robot, config.physics, field, config.gyro)
+    executor = Executor(loco, low)
     decoder, start = CommandDecoder(config.commands), default_command()
     for j, name in enumerate(CONTINUOUS):
         label = name if UNITS[j] == "1" else f"{name} ({UNITS[j]})"
@@ -100,15 +102,8 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
     try:
         while True:
             values = stage.read_sliders()
-            loco.command[0] = slider_command(values[:-1])
-            actions, _ = low.predict(loco.observe())
-            loco.act(actions)
-            x, y = loco.world.state.position[:, :2].T
-            if (
-                values[-1] != pressed
-                or is_fallen(loco.world)[0]
-                or not field.on_tile(0, 0, x, y)[0]
-            ):
+            executor.step(slider_command(values[:-1])[None])
+            if values[-1] != pressed or outcome(loco.world)[0] != GOING:
                 pressed = float(values[-1])
                 begin()
             window.update(step, describe(loco.command[0]))

@@ -30,7 +30,7 @@ from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import TILE_SIZE
-from tdgc.tasks.low_env import GOAL_RADIUS
+from tdgc.tasks.rules import GOAL_RADIUS
 
 # Okabe and Ito's palette, which colour-blind eyes tell apart.
 POLICY_COLOURS = {

@@ -24,14 +24,12 @@ import tdgc
 from tdgc.benchmark.diagnosis import LAYERS
 from tdgc.benchmark.evaluation import (
     CONDITIONS,
-    HORIZON,
-    OUTCOMES,
     PUSH_INTERVAL,
     Condition,
     EpisodeRecord,
 )
 from tdgc.sim.terrain import file_label
-from tdgc.tasks.low_env import FALL_HEIGHT, GOAL_RADIUS, TRUNK_FORCE
+from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
 NAME = "report.html"
 #: Bytes of films in a page, a choice: ten of 2 MB each, the size of an MP4 of a whole episode. What
@@ -112,6 +110,14 @@ def describe_condition(condition: Condition) -> str:
         changes.append(f"commands reach the joints {1000 * condition.latency:g} ms late")
     if condition.physics_hz is not None:
         changes.append(f"physics at {condition.physics_hz} Hz")
+    if condition.noise is not None:
+        noise = condition.noise
+        changes.append(
+            f"noise of the sensors as in training; the gait clock starts at random; height probes "
+            f"off by up to {100 * noise.noise_probes:g} cm and a decision late"
+        )
+    if not condition.told:
+        changes.append('the terrain family is "unknown" to the policy')
     return "; ".join(changes) or "nothing"
 
 

@@ -25,6 +25,7 @@ from tdgc.sim.robot import (
     nominal_pose,
     yaw_quaternion,
 )
+from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TileField
 from tdgc.sim.world import World
 from tdgc.state import State, copies, fill
@@ -276,14 +277,10 @@ class Locomotion:
         self.apply_dynamics(np.arange(self.num_robots))
         self.world.forget()
 
-    def observe(
-        self,
-        noise: RandomisationConfig | None = None,
-        rng: np.random.Generator | None = None,
-    ) -> NDArray[np.float32]:
+    def observe(self, noise: Noise | None = None) -> NDArray[np.float32]:
         """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g], (M, 71), and 3 more with a gyro.
 
-        With ``noise`` and ``rng`` the measured parts carry uniform noise.
+        With ``noise`` the measured parts carry it; it is uniform.
         """
         state = self.world.state
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
@@ -291,15 +288,11 @@ class Locomotion:
         error = state.q - self.joint_offset - self.pose()
         speed = state.qd
         gyro = np.einsum("mji,mj->mi", state.rotation, state.ang_vel)
-        if noise is not None and rng is not None:
-
-            def jitter(like: Array, width: float) -> Array:
-                return noise.scale * width * rng.uniform(-1.0, 1.0, like.shape)
-
-            gravity = gravity + jitter(gravity, noise.noise_gravity)
-            error = error + jitter(error, noise.noise_joint_angle)
-            speed = speed + jitter(speed, noise.noise_joint_speed)
-            gyro = gyro + jitter(gyro, noise.noise_gyro)
+        if noise is not None:
+            gravity = gravity + noise.draw(noise.config.noise_gravity, gravity.shape)
+            error = error + noise.draw(noise.config.noise_joint_angle, error.shape)
+            speed = speed + noise.draw(noise.config.noise_joint_speed, speed.shape)
+            gyro = gyro + noise.draw(noise.config.noise_gyro, gyro.shape)
         parts = [
             gravity,
             error,

@@ -433,10 +433,15 @@ class World:
             for link in self._trunk_links:
                 for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=link):
                     row = client.rows[contact[2]]
-                    pressed[row] = pressed.get(row, 0.0) + contact[9]
+                    pressed[row] = pressed.get(row, 0.0) + self._force(contact)
             for row, force in pressed.items():
                 state.trunk_force[row] = max(force, state.trunk_force[row])
         state.q[live], state.qd[live], state.torque[live] = q, qd, torque
+
+    def _force(self, contact: tuple[Any, ...]) -> float:
+        """Normal force of a contact in N: Bullet divides the impulse of its last internal step by
+        the time of all of them."""
+        return float(contact[9] * self.physics.hold)
 
     def _read_contacts(self) -> None:
         """Forces of the last physics step, split into feet and the legs above them.
@@ -451,7 +456,7 @@ class World:
         reach = (self.state.geometry.foot_radius + _FOOT_REACH) ** 2
         for client in self._clients:
             for contact in client.getContactPoints(bodyA=client.ground):
-                force, link = contact[9], contact[4]
+                force, link = self._force(contact), contact[4]
                 leg = self._leg_of_link.get(link)
                 if force <= 0.0 or leg is None:  # None is the trunk
                     continue

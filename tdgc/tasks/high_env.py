@@ -27,13 +27,16 @@ from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
 from tdgc.sim.robot import NUM_JOINTS, Array, wrap_angle
+from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import FAMILIES, draw_start_goal
-from tdgc.sim.world import World
 from tdgc.state import State, copies, fill
 from tdgc.tasks import rewards
 from tdgc.tasks.curriculum import Curriculum
+from tdgc.tasks.executor import Executor
 from tdgc.tasks.leaps import Landing
-from tdgc.tasks.low_env import GOAL_RADIUS, TaskEnv, is_fallen
+from tdgc.tasks.low_env import TaskEnv
+from tdgc.tasks.probes import PROBE_RANGE, PROBES, HeightProbes
+from tdgc.tasks.rules import REACHED, has_failed, outcome
 from tdgc.tasks.teacher import Teacher
 from tdgc.tasks.tiles import TrainingTiles
 
@@ -41,12 +44,6 @@ from tdgc.tasks.tiles import TrainingTiles
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
 
 GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
-PROBE_RANGE = 0.5  # m, deeper and higher looks the same
-
-#: The sparse geometric cue: 32 heights in the heading frame, from a hind foot to three strides
-#: ahead, staggered over four lines: an edge across the way is found to 5 cm, and a pillar on it,
-#: 20 cm wide at least, meets a probe.
-PROBES: Array = np.array([(0.05 * i - 0.25, (0.1, -0.3, 0.3, -0.1)[i % 4]) for i in range(32)])
 _GUIDANCE = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
 
 #: The semantic cue: one-hot over the families, and one place for "unknown".
@@ -71,16 +68,6 @@ def high_layout(cues: str) -> tuple[tuple[str, int], ...]:
     return tuple(layout)
 
 
-def height_probes(loco: Locomotion) -> Array:
-    """Ground under ``PROBES`` against where a standing robot's ground would be, (M, 32) m."""
-    state = loco.world.state
-    c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
-    x = state.position[:, :1] + c * PROBES[:, 0] - s * PROBES[:, 1]
-    y = state.position[:, 1:2] + s * PROBES[:, 0] + c * PROBES[:, 1]
-    standing = state.position[:, 2:3] - loco.robot.base_height
-    return np.clip(loco.world.ground_height(x, y) - standing, -PROBE_RANGE, PROBE_RANGE)
-
-
 def observe_high(
     loco: Locomotion,
     goal: Array,
@@ -88,6 +75,7 @@ def observe_high(
     last_action: Array,
     families: NDArray[np.int64],
     cues: str,
+    probes: Array,
 ) -> NDArray[np.float32]:
     """o^H of M robots, (M, sum of ``high_layout``).
 
@@ -98,6 +86,7 @@ def observe_high(
         last_action: (M, 13), normalised.
         families: (M,) index into ``SEMANTIC``.
         cues: both, semantic, geometric or none.
+        probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
     """
     state = loco.world.state
     offset = goal - state.position[:, :2]
@@ -115,7 +104,7 @@ def observe_high(
     if cues in ("both", "semantic"):
         parts.append(np.eye(len(SEMANTIC))[families])
     if cues in ("both", "geometric"):
-        parts.append(height_probes(loco) / PROBE_RANGE)
+        parts.append(probes / PROBE_RANGE)
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 
@@ -164,19 +153,22 @@ def high_step(
     )
 
 
-def check_pair(high: HighLevelConfig, low: LowLevelConfig) -> None:
-    """Refuse decoder bounds that the low level was not trained on.
+def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
+    """The MDP of a high policy on a low policy: with the decoder's bounds, if it has none.
 
     Raises:
-        ConfigError: names the command and both ranges.
+        ConfigError: bounds that the low policy was not trained on; names the command and both.
     """
+    if high.commands is None:
+        return dataclasses.replace(high, commands=low.commands)
     for f in dataclasses.fields(low.commands):
         asked, trained = getattr(high.commands, f.name), getattr(low.commands, f.name)
         if asked[0] < trained[0] or asked[1] > trained[1]:
             raise ConfigError(
-                f"commands.{f.name} asks for {list(asked)}, but the low level was trained on "
+                f"commands.{f.name} asks for {list(asked)}, but the low policy was trained on "
                 f"{list(trained)}"
             )
+    return high
 
 
 def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
@@ -223,11 +215,11 @@ class NavigationTask:
         guided: int = 0,
         landing: Landing | None = None,
     ) -> None:
-        self.config, self._visual = config, visual
+        self.low, self.low_config = load_low(low)
+        self.config = config = paired(config, self.low_config)
+        self._visual = visual
         self.num_robots = m = num_robots
         self.training = training
-        self.low, self.low_config = load_low(low)
-        check_pair(config, self.low_config)
         self.decoder = CommandDecoder(config.commands, config.action_limit)
         self.rng = np.random.default_rng(seed)
         self.step_seconds = config.decimation * self.low_config.physics.control_dt
@@ -238,7 +230,7 @@ class NavigationTask:
         self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, first)
         self.tiles = TrainingTiles([config.families[f] for f in self.family], seed)
         self.field = self.tiles.field
-        self.locomotion = self._build_locomotion()
+        self._build_robots()
         self._origin = self.field.origin(np.arange(m), 0)
         self.goal = np.zeros((m, 2))
         self.elapsed = np.zeros(m, dtype=np.int64)
@@ -248,7 +240,8 @@ class NavigationTask:
         self._commands = np.zeros((3, m, 15))
         self.stats: dict[str, float] = {}
         families = [config.families[f] for f in self.family]
-        self.teacher = Teacher(self.field, families, landing) if guided else None
+        ranges = self.low_config.commands
+        self.teacher = Teacher(self.field, families, ranges, landing) if guided else None
         self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
@@ -260,10 +253,13 @@ class NavigationTask:
         self.action_space = gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
-    def _build_locomotion(self) -> Locomotion:
+    def _build_robots(self) -> None:
         self.tiles.draw(np.arange(self.num_robots), self.curriculum.levels)
-        c = self.low_config
-        return Locomotion(self.num_robots, c.robot, c.physics, self.field, c.gyro, self._visual)
+        c, m = self.low_config, self.num_robots
+        noise = Noise(self.config.randomisation, self.rng) if self.training else None
+        self.locomotion = Locomotion(m, c.robot, c.physics, self.field, c.gyro, self._visual)
+        self._executor = Executor(self.locomotion, self.low, noise)
+        self._probes = HeightProbes(self.locomotion, noise)
 
     # ------------------------------------------------------------------ episodes
 
@@ -287,6 +283,7 @@ class NavigationTask:
         self.locomotion.place(
             index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
         )
+        self._probes.begin(index)
         if self.teacher is not None:
             self.teacher.begin(index, self.goal)
             share = 1.0 - self._decisions[0] / (_GUIDANCE * self._guided)
@@ -299,7 +296,7 @@ class NavigationTask:
     def restart(self) -> None:
         """End every episode, draw new tiles and build the world anew (see ``LowLevelTask``)."""
         self.locomotion.world.close()
-        self.locomotion = self._build_locomotion()
+        self._build_robots()
         self.reset(np.arange(self.num_robots))
 
     def step(
@@ -320,22 +317,18 @@ class NavigationTask:
         commands = self.decoder.decode(actions)
         share = command_share(commands, self.decoder)
         self._commands = np.concatenate([share[None], self._commands[:-1]])
-        loco.command[:] = commands
         failed = np.zeros(self.num_robots, dtype=bool)
         force = np.zeros((self.num_robots, 5))
         reached = self._reached_at >= 0
         for _ in range(c.decimation):
-            low_actions = self.low.predict(loco.observe(c.randomisation, self.rng))[0]
-            # A robot that has blown up sees no numbers, so it has no action either. Its decision is
-            # carried through all the same: who reads its observation then finds it out.
-            low_actions[~np.isfinite(low_actions).all(axis=1)] = 0.0
-            loco.act(low_actions)
-            failed |= self._failed(loco.world)
+            self._executor.step(commands)
+            ended = outcome(loco.world, self.goal)
+            failed |= has_failed(ended)
+            reached |= (ended == REACHED) & ~failed
             state = loco.world.state
             now = np.column_stack([state.trunk_force, state.leg_force])
             np.maximum(force, now, out=force)
-            distance = np.linalg.norm(self.goal - state.position[:, :2], axis=1)
-            reached |= (distance < GOAL_RADIUS) & ~failed
+        self._probes.measure()
         self.elapsed += 1
         self._reached_at[reached & (self._reached_at < 0)] = self.elapsed[
             reached & (self._reached_at < 0)
@@ -361,10 +354,6 @@ class NavigationTask:
             self._push()
         return reward, failed, truncated
 
-    def _failed(self, world: World) -> NDArray[np.bool_]:
-        x, y = world.state.position[:, 0], world.state.position[:, 1]
-        return is_fallen(world) | ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
-
     def observe(self) -> NDArray[np.float32]:
         """o^H, (M, actor_dim), and with a teacher its actions, (M, 13)."""
         seen = observe_high(
@@ -374,6 +363,7 @@ class NavigationTask:
             self._actions[0],
             self.family_index,
             self.config.cues,
+            self._probes.read(),
         )
         if self.teacher is None:
             return seen
@@ -465,6 +455,8 @@ class NavigationTask:
             "actions": self._actions,
             "commands": self._commands,
             "led": self._led,
+            "probes": self._probes.measured,
+            "late": self._probes.late,
             "taught": self._taught,
         }
 

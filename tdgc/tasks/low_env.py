@@ -20,6 +20,7 @@ from tdgc.sim.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import MIRRORS, Locomotion, action_mirror, mirror_map
 from tdgc.sim.robot import NUM_JOINTS, Array, wrap_angle
+from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import (
     MAX_LEVEL,
     TILE_SIZE,
@@ -27,15 +28,11 @@ from tdgc.sim.terrain import (
     Tile,
     draw_start_goal,
 )
-from tdgc.sim.world import World
 from tdgc.state import State, copies, fill
 from tdgc.tasks import rewards
 from tdgc.tasks.leaps import SPEED, SWING_HEIGHT, Landing, LeapPlan
+from tdgc.tasks.rules import GOAL_RADIUS, is_fallen
 from tdgc.tasks.tiles import FLAT, TrainingTiles
-
-FALL_HEIGHT = 0.15  # m, trunk above the support surface (paper Sec. IV-C)
-TRUNK_FORCE = 40.0  # N (paper Sec. IV-C)
-GOAL_RADIUS = 0.5  # m (paper Sec. IV-C)
 
 # Terrain that the critic sees: 5 x 3 points in the heading frame, from the tail to a step ahead.
 _PROBES = np.array([(x, y) for x in (-0.3, -0.1, 0.1, 0.3, 0.5) for y in (0.15, 0.0, -0.15)])
@@ -102,14 +99,6 @@ _GROW_LIN, _GROW_YAW = 0.5, 0.5
 # Share of feet in contact as desired: speed comes after gait. At 0.8 bound never left its first
 # ranges, since its rear feet lift late, and then undershot every faster command.
 _GROW_CONTACT = 0.7
-
-
-def is_fallen(world: World) -> NDArray[np.bool_]:
-    """The paper's failures that concern the body: (M,) trunk low or hit."""
-    state = world.state
-    support = world.support_height(state.position[:, 0], state.position[:, 1])
-    low = state.position[:, 2] - support < FALL_HEIGHT
-    return np.asarray(low | (state.trunk_force > TRUNK_FORCE))
 
 
 def shallow(tile: Tile, level: int) -> Tile:
@@ -290,8 +279,8 @@ class LowLevelTask:
 
     def observe(self) -> NDArray[np.float32]:
         """(M, obs_dim): the actor's part, noisy in training, and the critic's."""
-        noise = self.config.randomisation if self.training else None
-        actor = self.locomotion.observe(noise, self.rng)
+        noise = Noise(self.config.randomisation, self.rng) if self.training else None
+        actor = self.locomotion.observe(noise)
         return np.concatenate([actor, self._critic()], axis=1).astype(np.float32)
 
     def _critic(self) -> Array:

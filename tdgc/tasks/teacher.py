@@ -59,6 +59,7 @@ def toward(
     top_speed: Array | float,
     distance_gain: float = 1.0,
     heading_gain: float = 1.5,
+    turns: tuple[float, float] = CommandRanges().yaw_rate,
 ) -> tuple[Array, Array]:
     """Forward speed in m/s and yaw rate in rad/s towards a point, (M,) each.
 
@@ -68,9 +69,10 @@ def toward(
         distance, error: (M,) m and rad, of the point's bearing against the heading.
         top_speed: (M,) or one for all, m/s.
         distance_gain, heading_gain: 1/s.
+        turns: rad/s, least and greatest yaw rate.
     """
     speed = np.minimum(top_speed, distance_gain * distance)
-    turn = np.clip(heading_gain * error, *CommandRanges().yaw_rate)
+    turn = np.clip(heading_gain * error, *turns)
     return speed * np.maximum(np.cos(error), 0.0), turn
 
 
@@ -129,18 +131,23 @@ class Teacher:
     Args:
         field: (M, 1) tiles.
         families: of the robots, (M,) names.
-        landing: of the low level that they have.
+        ranges: of the commands that their low policy was trained on.
+        landing: of the low policy.
 
     Raises:
         ValueError: a family it has no style for.
     """
 
     def __init__(
-        self, field: TileField, families: Sequence[str], landing: Landing | None = None
+        self,
+        field: TileField,
+        families: Sequence[str],
+        ranges: CommandRanges,
+        landing: Landing | None = None,
     ) -> None:
         check_styles(families)
         m = len(families)
-        self._field, self._landing = field, landing or Landing()
+        self._field, self._ranges, self._landing = field, ranges, landing or Landing()
         self._origin = field.origin(np.arange(m), 0)
         self._leaps = np.array([family == "gap" for family in families])
         self._pillars = np.array([family == "pillar" for family in families])
@@ -149,7 +156,7 @@ class Teacher:
         for name in ("frequency", "swing_height", "stance_width"):
             self._command[:, INDEX[name]] = [getattr(style, name) for style in styles]
         self._speed = np.array([style.speed for style in styles])
-        self._plan = LeapPlan(m, CommandRanges())
+        self._plan = LeapPlan(m, ranges)
         self._end = np.full(m, -np.inf)  # m, x where a robot has no more to leap over
         self._fields: dict[int, tuple[Array, float, float]] = {}
 
@@ -176,15 +183,15 @@ class Teacher:
                 bearing[i] = _downhill(field, local[i], bearing[i])
         error = wrap_angle(bearing - state.yaw)
         command = self._command.copy()
-        speed, turn = toward(distance, error, self._speed)
+        speed, turn = toward(distance, error, self._speed, turns=self._ranges.yaw_rate)
         command[:, INDEX["vx"]], command[:, INDEX["yaw_rate"]] = speed, turn
         rows = np.flatnonzero(self._leaps & (local[:, 0] < self._end))
         if rows.size:
             # Facing across the trenches both feet of a pair land on one line; sideways to the goal.
             leaps, fast = command[rows], self._speed[rows]
             leaps[:, INDEX["vx"]] = fast * np.cos(bearing[rows])
-            leaps[:, INDEX["vy"]] = np.clip(fast * np.sin(bearing[rows]), *CommandRanges().vy)
-            turn = np.clip(-_LEAP_TURN * state.yaw[rows], *CommandRanges().yaw_rate)
+            leaps[:, INDEX["vy"]] = np.clip(fast * np.sin(bearing[rows]), *self._ranges.vy)
+            turn = np.clip(-_LEAP_TURN * state.yaw[rows], *self._ranges.yaw_rate)
             leaps[:, INDEX["yaw_rate"]] = turn
             steps = self._plan.steps(
                 rows,

@@ -1,0 +1,120 @@
+"""The low policy alone, on a plane: how it tracks commands in each gait, how often it falls."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.benchmark.evaluation import Spread, low_config, spread
+from tdgc.config import CommandRanges
+from tdgc.policies import Policy
+from tdgc.sim.commands import CONTINUOUS, INDEX
+from tdgc.sim.gaits import GAITS, gait_embedding
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.sim.terrain import EVAL_STREAM
+from tdgc.tasks.executor import Executor
+from tdgc.tasks.rewards import CONTACT_FORCE
+from tdgc.tasks.rules import is_fallen
+
+_TRACKING_SECONDS = 10.0  # an episode: one command
+_SETTLE_SECONDS = 1.0  # not counted: speeding up from rest
+_SWITCH_SECONDS = 2.0  # between gaits in the falls test
+_FALL_SHARE, _FALL_SECONDS = 0.6, 20.0  # of the episodes: 100 a gait make 20 minutes of walking
+
+
+def draw_commands(
+    rng: np.random.Generator, ranges: CommandRanges, gait: NDArray[np.integer]
+) -> Array:
+    """Commands of robots in these gaits (n,), the others over the full ranges, (n, 15)."""
+    bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
+    continuous = rng.uniform(bounds[:, 0], bounds[:, 1], (len(gait), len(CONTINUOUS)))
+    return np.concatenate([continuous, gait_embedding(gait)], axis=1)
+
+
+def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Locomotion]:
+    """``m`` nominal robots that start from rest.
+
+    Yields before each control step, so that the caller may set commands and look.
+    """
+    config = low_config(low)
+    loco = Locomotion(m, config.robot, config.physics, None, config.gyro)
+    executor, rows = Executor(loco, low), np.arange(m)
+    rng = np.random.default_rng(seed)
+    spots = 5.0 * np.stack([rows % 10, rows // 10], axis=1).astype(np.float64)
+    loco.place(rows, spots, rng.uniform(-np.pi, np.pi, m), rng.uniform(size=m))
+    try:
+        for _ in range(round(seconds / config.physics.control_dt)):
+            yield loco
+            executor.step(loco.command)
+    finally:
+        loco.world.close()
+
+
+def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, float]:
+    """Tracking of one gait on the plane, commands over the full ranges.
+
+    RMSE of the instantaneous planar velocity (heading frame) and yaw rate at every control step
+    after the first second, and the share of foot samples whose contact is the desired one.
+    """
+    config, g = low_config(low), GAITS.index(gait)
+    rng = np.random.default_rng((EVAL_STREAM, seed, g))
+    command = draw_commands(rng, config.commands, np.full(episodes, g))
+    settle = round(_SETTLE_SECONDS / config.physics.control_dt)
+    lin = yaw = match = count = 0.0
+    for step, loco in enumerate(walk_on_plane(low, episodes, _TRACKING_SECONDS, seed)):
+        state = loco.world.state
+        if step > settle:
+            lin += float(np.sum((state.heading_vel[:, :2] - command[:, :2]) ** 2))
+            yaw += float(np.sum((state.ang_vel[:, 2] - command[:, INDEX["yaw_rate"]]) ** 2))
+            wanted = loco.clock.contact > 0.5
+            match += float(np.mean((state.foot_force > CONTACT_FORCE) == wanted)) * episodes
+            count += episodes
+        loco.command[:] = command
+    return {
+        "velocity_rmse": (lin / count) ** 0.5,
+        "yaw_rate_rmse": (yaw / count) ** 0.5,
+        "contact_match": match / count,
+    }
+
+
+def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
+    """Falls while the gait switches at random every 2 s, commands over the full ranges.
+
+    A robot that falls stays out, and its time counts up to the fall.
+    """
+    config = low_config(low)
+    m, dt = robots, config.physics.control_dt
+    rng = np.random.default_rng((EVAL_STREAM, seed, len(GAITS)))
+    switch = round(_SWITCH_SECONDS / dt)
+    command = draw_commands(rng, config.commands, np.zeros(m, dtype=np.int64))
+    up = np.ones(m, dtype=bool)
+    minutes = 0.0
+    for step, loco in enumerate(walk_on_plane(low, m, _FALL_SECONDS, seed)):
+        up &= ~is_fallen(loco.world)
+        minutes += up.sum() * dt / 60.0
+        if step % switch == 0:
+            command[:, 12:] = gait_embedding(rng.integers(0, len(GAITS), m))
+        loco.command[:] = command
+    falls = int((~up).sum())
+    return {"falls": falls, "minutes": minutes, "falls_per_10_min": 10.0 * falls / minutes}
+
+
+def _track(job: tuple[str, int, int], low: Policy) -> dict[str, float]:
+    gait, episodes, seed = job
+    return track_gait(low, gait, episodes, seed) if gait else count_falls(low, episodes, seed)
+
+
+def tracking(
+    low: Policy, episodes: int, seed: int, workers: int, share_out: Spread = spread
+) -> dict[str, Any]:
+    """tracking.json: each gait's tracking and the falls; ``share_out`` is a kind of ``spread``."""
+    robots = max(1, round(_FALL_SHARE * episodes))
+    jobs = [(gait, episodes, seed) for gait in GAITS] + [("", robots, seed)]
+    results = list(share_out(functools.partial(_track, low=low), jobs, workers))
+    falls = results.pop()
+    return {"gaits": dict(zip(GAITS, results, strict=True)), **falls}

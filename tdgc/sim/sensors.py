@@ -1,0 +1,47 @@
+"""Noise of the robots' sensors, drawn in training and in the evaluation's condition ``noise``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from tdgc.config import RandomisationConfig
+from tdgc.sim.robot import Array
+
+
+class Draws(Protocol):
+    """What sensors draw their errors from: ``np.random.Generator``, or ``EpisodeDraws``."""
+
+    def uniform(self, low: float, high: float, size: tuple[int, ...]) -> Array: ...
+
+
+class EpisodeDraws:
+    """Draws for M robots, each from a generator of its own: an episode's errors follow from its
+    seed, whoever runs beside it.
+
+    Args:
+        seeds: of the M generators.
+    """
+
+    def __init__(self, seeds: Iterable[Sequence[int]]) -> None:
+        self._generators = [np.random.default_rng(seed) for seed in seeds]
+
+    def uniform(self, low: float, high: float, size: tuple[int, ...]) -> Array:
+        """Uniform values of shape ``size``, (M, ...)."""
+        return np.stack([g.uniform(low, high, size[1:]) for g in self._generators])
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Errors of the sensors: their widths, and what they are drawn from."""
+
+    config: RandomisationConfig
+    draws: Draws
+
+    def draw(self, width: float, shape: tuple[int, ...]) -> Array:
+        """Errors of shape ``shape``, (M, ...), uniform within +-``width`` times the config's
+        scale."""
+        return np.asarray(self.config.scale * width * self.draws.uniform(-1.0, 1.0, shape))

@@ -1,0 +1,50 @@
+"""The executor: the lower half of the paper's closed loop, commands -> joint targets -> physics."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import NUM_JOINTS, Array
+from tdgc.sim.sensors import Noise
+
+
+class Acts(Protocol):
+    """What the executor needs of a low policy."""
+
+    def predict(self, obs: NDArray[np.float32]) -> tuple[NDArray[np.floating], Any]:
+        """Observations (n, d) -> actions (n, 12), and what does not matter here."""
+
+
+class Executor:
+    """Robots that carry commands out by a frozen low policy.
+
+    Args:
+        loco: the M robots.
+        low: the low policy.
+        noise: of what it observes, drawn at each control step; None for exact sensors.
+    """
+
+    def __init__(self, loco: Locomotion, low: Acts, noise: Noise | None = None) -> None:
+        self.loco, self._low, self._noise = loco, low, noise
+        self._actions = np.zeros((loco.num_robots, NUM_JOINTS), dtype=np.float32)
+
+    def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
+        """One control step: commands -> low policy -> joint targets -> physics.
+
+        Args:
+            commands: (M, 15).
+            rows: (n,) the robots that decide; the others keep their last action. All by default.
+        """
+        self.loco.command[:] = commands
+        seen = self.loco.observe(self._noise)
+        rows = np.arange(len(seen)) if rows is None else rows
+        actions, _ = self._low.predict(seen[rows])
+        # A robot that has blown up sees no numbers, so it has no action either. The step is carried
+        # out all the same: whoever looks at its state then finds it out.
+        actions[~np.isfinite(actions).all(axis=1)] = 0.0
+        self._actions[rows] = actions
+        self.loco.act(self._actions)

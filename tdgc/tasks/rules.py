@@ -1,0 +1,54 @@
+"""The rules of an episode (paper Sec. IV-C; TDGC-Bench, "Episode"): when it ends, and how."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.sim.robot import Array
+from tdgc.sim.world import World
+
+FALL_HEIGHT = 0.15  # m, trunk above the support surface (paper Sec. IV-C)
+TRUNK_FORCE = 40.0  # N (paper Sec. IV-C)
+GOAL_RADIUS = 0.5  # m (paper Sec. IV-C)
+HORIZON = 20.0  # s (TDGC-Bench)
+
+#: How an episode can end. Beside these an episode that goes on is -1.
+OUTCOMES = ("reached", "fell", "collided", "left_tile", "timeout")
+REACHED, FELL, COLLIDED, LEFT_TILE, TIMEOUT = range(len(OUTCOMES))
+GOING = -1
+
+
+def outcome(
+    world: World, goal: Array | None = None, time_is_up: NDArray[np.bool_] | bool = False
+) -> NDArray[np.int64]:
+    """How each robot's episode ends now, (M,): an index into ``OUTCOMES``, ``GOING`` if it doesn't.
+
+    Failure goes before success: a robot that falls into the goal has fallen. Robot i is on tile
+    (i, 0) of the world's field.
+
+    Args:
+        world: the robots; on a plane, which has no field, there is no tile to leave.
+        goal: (M, 2) m in the world; without one nothing is reached.
+        time_is_up: (M,), or one for all.
+    """
+    x, y, z = world.state.position.T
+    ended = np.where(time_is_up, TIMEOUT, np.full(len(x), GOING))
+    if goal is not None:
+        ended[np.hypot(*(world.state.position[:, :2] - goal).T) < GOAL_RADIUS] = REACHED
+    if world.field is not None:
+        ended[~world.field.on_tile(np.arange(len(x)), 0, x, y)] = LEFT_TILE
+    ended[world.state.trunk_force > TRUNK_FORCE] = COLLIDED
+    ended[z - world.support_height(x, y) < FALL_HEIGHT] = FELL
+    return ended
+
+
+def has_failed(ended: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of these outcomes are failures: all ends but reaching the goal and running out of
+    time, which truncates an episode."""
+    return np.isin(ended, (FELL, COLLIDED, LEFT_TILE))
+
+
+def is_fallen(world: World) -> NDArray[np.bool_]:
+    """The failures that concern the body alone: trunk low or hit, (M,)."""
+    return np.isin(outcome(world), (FELL, COLLIDED))
