@@ -17,8 +17,9 @@ import functools
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tqdm import tqdm
 
@@ -29,13 +30,15 @@ from tdgc.benchmark.evaluation import (
     CONDITIONS,
     Cell,
     Episode,
+    Spread,
+    Watcher,
     low_config,
     plan,
     run_cell,
     spread,
 )
 from tdgc.benchmark.recording import Recorder, Recording, Together
-from tdgc.benchmark.results import write_results
+from tdgc.benchmark.results import describe, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, check_installed, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
@@ -54,6 +57,7 @@ from tdgc.tasks.teacher import STYLES
 
 POLICIES = ("tdgc", "gp")
 TEACHER = "teacher"
+ALL_POLICIES = (*POLICIES, TEACHER)
 TUNED = "tdgc-tuned"  # beside "tdgc" where there is a tuning
 SHIPPED_HIGH = PRETRAINED / "high"
 
@@ -122,9 +126,13 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def choose(
     text: str, allowed: tuple[str, ...], everything: tuple[str, ...], what: str
-) -> list[str]:
-    """The names in a comma-separated flag; ``all`` stands for ``everything``."""
-    names = list(everything) if text == "all" else text.split(",")
+) -> tuple[str, ...]:
+    """The names in a comma-separated flag; ``all`` stands for ``everything``.
+
+    Raises:
+        ValueError: a name that is not allowed, or one of them twice.
+    """
+    names = everything if text == "all" else tuple(text.split(","))
     for name in names:
         if name not in allowed:
             raise ValueError(f"unknown {what} '{name}'; allowed: all, {', '.join(allowed)}")
@@ -133,8 +141,8 @@ def choose(
     return names
 
 
-def choose_levels(text: str) -> list[int]:
-    """``6-10`` or ``0,5,10`` as a list of levels.
+def choose_levels(text: str) -> tuple[int, ...]:
+    """``6-10`` or ``0,5,10`` as levels.
 
     Raises:
         ValueError: not numbers, outside 0-12, or one of them twice.
@@ -151,49 +159,183 @@ def choose_levels(text: str) -> list[int]:
         raise ValueError(f"--levels '{text}' must name levels from 0 to {top}")
     if len(set(levels)) < len(levels):
         raise ValueError(f"--levels '{text}' names a level twice")
-    return levels
+    return tuple(levels)
 
 
-def load_tuning(args: argparse.Namespace) -> Tuning | None:
-    """The tuning that ``--tune`` and ``--set`` ask for, None without either.
+@dataclass(frozen=True)
+class Evaluation:
+    """What is evaluated, and what is looked at.
 
-    Raises:
-        ValueError: one that cannot be read.
-    """
-    if args.tune is None and not args.assignments:
-        return None
-    return tuning.load(args.tune, args.assignments)
-
-
-def make_drivers(
-    names: list[str],
-    high: Path | None,
-    low: Policy,
-    config: LowLevelConfig,
-    tuned: Tuning | None = None,
-) -> dict[str, Driver]:
-    """What drives the robots of each policy asked for, and of the tuned one after ``tdgc``.
+    Attributes:
+        mode: a table of episodes; the low policy's tracking; or Bullet's window, to drive or watch.
+        policies, conditions, families, levels: names and numbers, each once.
+        episodes: of a cell.
+        low, high: policies' files.
+        seed: of the evaluation's tiles.
+        tuning: that ``tdgc`` is compared with; None for none.
+        traced: whose traces are written; None without traces and diagnoses.
+        filmed: films of so many episodes of each cell.
+        cluster: address of a cluster that runs the episodes; None for this machine.
+        workers: processes.
+        out: results folder.
 
     Raises:
-        ValueError: no high level, one that does not fit the low level, or a tuning that fits
-            neither.
+        ValueError: values that cannot be used, or not together.
     """
-    if tuned is not None and "tdgc" not in names:
-        raise ValueError("--tune and --set change tdgc, which is not among the policies")
-    drivers: dict[str, Driver] = {}
-    for name in names:
-        if name == "gp":
-            drivers[name] = BaselineDriver()
-        elif name == TEACHER:
-            drivers[name] = TeacherDriver(low, config)
-        elif high is None:
+
+    mode: Literal["table", "tracking", "drive", "watch"]
+    policies: tuple[str, ...]
+    conditions: tuple[str, ...]
+    families: tuple[str, ...]
+    levels: tuple[int, ...]
+    episodes: int
+    low: Path
+    high: Path | None
+    seed: int
+    tuning: Tuning | None
+    traced: Selection | None
+    filmed: int
+    cluster: str | None
+    workers: int
+    out: Path
+
+    def __post_init__(self) -> None:
+        for flag, value in (("--episodes", self.episodes), ("--workers", self.workers)):
+            if value < 1:
+                raise ValueError(f"{flag} must be at least 1, not {value}")
+        if not 0 <= self.seed < 2**32:
+            raise ValueError(f"--seed must lie in [0, 2**32), not {self.seed}")
+        if not 0 <= self.filmed <= self.episodes:
+            raise ValueError(f"--video must lie in [0, --episodes], not {self.filmed}")
+        if self.traced is not None:
+            check_installed()
+        for name in filter(is_map, self.families):
+            height_map(name)
+        if "tdgc" in self.policies and self.high is None and self.mode != "tracking":
             raise ValueError("no high level is shipped; give one with --high, or use --policies gp")
-        else:
-            pair = load_high(high, low, config)
-            drivers[name] = HierarchyDriver(*pair)
-            if tuned is not None:
-                drivers[TUNED] = TunedDriver(*pair, config, tuned)
-    return drivers
+        self._check_mode()
+        self._check_policies()
+
+    def _check_mode(self) -> None:
+        if self.mode in gui.MODES:
+            if self.cluster is not None:
+                raise ValueError("--gui shows a robot of this machine: no --cluster")
+            if self.filmed or self.traced is not None:
+                raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
+        if self.mode == "tracking":
+            if self.filmed:
+                raise ValueError("--tracking has no episodes to film: no --video")
+            if self.traced is not None or self.tuning is not None:
+                raise ValueError(
+                    "--tracking is of the low level alone: no --trace, --tune or --set"
+                )
+
+    def _check_policies(self) -> None:
+        if self.tuning is not None and "tdgc" not in self.policies:
+            raise ValueError("--tune and --set change tdgc, which is not among the policies")
+        met = (*self.families, *(name for name in self.conditions if name in ALL_FAMILIES))
+        strange = [name for name in met if name not in STYLES]
+        if TEACHER in self.policies and strange:
+            known = ", ".join(STYLES)
+            raise ValueError(f"the {TEACHER} knows {known}; it cannot lead on {strange[0]}")
+        hidden = [name for name in self.conditions if not CONDITIONS[name].told]
+        if TEACHER in self.policies and hidden:
+            raise ValueError(f"the {TEACHER} is told the family; it cannot lead in {hidden[0]}")
+
+    @classmethod
+    def of(cls, flags: argparse.Namespace) -> Evaluation:
+        """What the flags ask for.
+
+        Raises:
+            ValueError: flags that cannot be read, or an evaluation that cannot be.
+            OSError: a file that cannot be read.
+        """
+        if flags.gui is not None and flags.tracking:
+            raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
+        shipped = SHIPPED_HIGH if SHIPPED_HIGH.with_suffix(".json").is_file() else None
+        high = flags.high or shipped
+        maps = tuple(name for name in flags.families.split(",") if is_map(name))
+        asked = flags.policies or ("gp" if high is None else "all")
+        tuned = flags.tune is not None or flags.assignments
+        evaluation = cls(
+            mode=flags.gui or ("tracking" if flags.tracking else "table"),
+            policies=choose(asked, ALL_POLICIES, POLICIES, "policy"),
+            conditions=choose(flags.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition"),
+            families=choose(flags.families, (*ALL_FAMILIES, *maps), FAMILIES, "family"),
+            levels=choose_levels(flags.levels),
+            episodes=flags.episodes,
+            low=flags.low,
+            high=high,
+            seed=flags.seed,
+            tuning=tuning.load(flags.tune, flags.assignments) if tuned else None,
+            traced=Selection.parse(flags.trace) if flags.trace is not None else None,
+            filmed=flags.video,
+            cluster=flags.cluster,
+            workers=usable_cores() if flags.workers == "auto" else flags.workers,
+            out=flags.out,
+        )
+        if flags.cluster is None:
+            return evaluation
+        cores = cluster.connect(flags.cluster)  # only for what can be evaluated
+        return replace(evaluation, workers=cores) if flags.workers == "auto" else evaluation
+
+    @property
+    def spread(self) -> Spread:
+        """What shares jobs out."""
+        return spread if self.cluster is None else cluster.spread
+
+    def drivers(self, low: Policy, config: LowLevelConfig) -> dict[str, Driver]:
+        """What drives the robots under each policy, and under the tuned one after ``tdgc``.
+
+        Raises:
+            ValueError: a high policy that does not fit the low one, or a tuning that fits neither.
+        """
+        if self.mode == "tracking":
+            return {}
+        drivers: dict[str, Driver] = {}
+        for name in self.policies:
+            if name == "gp":
+                drivers[name] = BaselineDriver()
+            elif name == TEACHER:
+                drivers[name] = TeacherDriver(low, config)
+            else:
+                assert self.high is not None
+                pair = load_high(self.high, low, config)
+                drivers[name] = HierarchyDriver(*pair)
+                if self.tuning is not None:
+                    drivers[TUNED] = TunedDriver(*pair, config, self.tuning)
+        return drivers
+
+    def make_room(self) -> None:
+        """Make the results folder; what an earlier table left and this one may not write goes
+        away."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        if self.mode != "table":
+            return
+        left = ["films/film_*", "films/sheet_*", "films/strip_*", "traces/*.parquet"]
+        left += ["diagnosis.csv", "tuning.json", report.NAME]
+        for old in [path for pattern in left for path in self.out.glob(pattern)]:
+            old.unlink()
+        for folder, wanted in (("films", self.filmed > 0), ("traces", self.traced is not None)):
+            if wanted:
+                (self.out / folder).mkdir(exist_ok=True)
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What came of a batch.
+
+    Attributes:
+        episodes: all of them.
+        recordings: of those that are filmed.
+        diagnoses: of failures, where traces are taken.
+        traces: that are written.
+    """
+
+    episodes: list[Episode]
+    recordings: list[Recording]
+    diagnoses: list[Diagnosis]
+    traces: list[Trace]
 
 
 def run_one(
@@ -203,51 +345,61 @@ def run_one(
     seed: int,
     filmed: int,
     traced: Selection | None,
-) -> tuple[list[Episode], list[Recording], list[Diagnosis], list[Trace]]:
-    """A batch, with recordings of the cell's first ``filmed`` episodes; with ``traced`` also its
-    diagnoses and the chosen traces. It writes nothing: it may run on another machine."""
+) -> Ran:
+    """Run a batch. It writes nothing: it may run on another machine."""
     driver = drivers[cell.policy]
-    recorder = Recorder(driver, seed, filmed)
-    if traced is None:
-        return run_cell(cell, low, driver, seed, recorder), recorder.recordings(), [], []
-    tracer = Tracer(driver, seed)
-    episodes = run_cell(cell, low, driver, seed, Together([tracer, recorder]))
-    traces = tracer.traces()
-    chosen = [trace for trace in traces if traced.includes(trace)]
+    recorder, tracer = Recorder(driver, seed, filmed), Tracer(driver, seed)
+    watcher: Watcher = recorder if traced is None else Together([tracer, recorder])
+    episodes = run_cell(cell, low, driver, seed, watcher)
+    traces = [] if traced is None else tracer.traces()
     hips = float(read_geometry(low_config(low).robot).hips[0, 0])
-    diagnoses = [diagnose(trace, hips) for trace in traces if trace.outcome != "reached"]
-    return episodes, recorder.recordings(), diagnoses, chosen
+    return Ran(
+        episodes,
+        recorder.recordings(),
+        [diagnose(trace, hips) for trace in traces if trace.outcome != "reached"],
+        [trace for trace in traces if traced is not None and traced.includes(trace)],
+    )
 
 
-def print_table(summary: dict[str, Any]) -> None:
-    """Rates with intervals: a line a family and level, the means below."""
-    for policy, conditions in summary.items():
-        for condition, families in conditions.items():
-            print(f"\n{policy}, {condition}")
-            names = [f for f in families if f != "mean"]
-            levels = list(families[names[0]])
-            wide = max(8, *(len(name) + 1 for name in names))
-            print("family".ljust(wide) + "".join(f"{level:>8}" for level in levels))
-            for name in names:
-                cells = "".join(f"{100 * families[name][lv]['rate']:7.1f}%" for lv in levels)
-                print(name.ljust(wide) + cells)
-            mean = families["mean"]
-            rate, low, high = (100 * mean[key] for key in ("rate", "ci_low", "ci_high"))
-            print(f"{'mean'.ljust(wide)}{rate:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}")
-
-
-def run_tracking(low: Policy, args: argparse.Namespace) -> int:
-    share_out = spread if args.cluster is None else cluster.spread
-    result = tracking(low, args.episodes, args.seed, args.workers, share_out)
-    (args.out / "tracking.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
-    print("gait    velocity RMSE  yaw rate RMSE  contact match")
-    for gait, r in result["gaits"].items():
-        print(
-            f"{gait:<8}{r['velocity_rmse']:9.3f} m/s{r['yaw_rate_rmse']:9.3f} rad/s"
-            f"{100 * r['contact_match']:13.1f} %"
-        )
-    print(f"{result['falls_per_10_min']:.2f} falls in 10 minutes ({result['minutes']:.1f} walked)")
-    return 0
+def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> list[str]:
+    """Run all cells and write everything; what is missing, a line each."""
+    e, out = evaluation, evaluation.out
+    cells = plan(list(drivers), e.conditions, e.families, e.levels, e.episodes)
+    work = functools.partial(
+        run_one, low=low, drivers=drivers, seed=e.seed, filmed=e.filmed, traced=e.traced
+    )
+    episodes: list[Episode] = []
+    recordings: list[Recording] = []
+    diagnoses: list[Diagnosis] = []
+    with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
+        for ran in e.spread(work, cells, e.workers):
+            for trace in ran.traces:
+                write(trace, out / "traces")
+            episodes += ran.episodes
+            recordings += ran.recordings
+            diagnoses += ran.diagnoses
+            bar.update(len(ran.episodes))
+    print(describe(write_results(out, episodes)))
+    plots.success_by_level(out / "summary.json", out / "success.png")
+    plots.gait_shares(out, out / "gaits.png")
+    plots.headings(out, out / "headings.png")
+    plots.trajectories(out, out / "trajectories.png")
+    if e.traced is not None:
+        diagnosis.write(diagnoses, out / "diagnosis.csv")
+        print(f"\n{diagnosis.describe(diagnoses, episodes)}")
+    if e.tuning is not None:
+        effect = tuning.compare(episodes, "tdgc", TUNED)
+        result = {"tuning": tuning.record(e.tuning), "effect": effect}
+        (out / "tuning.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
+        print_effect(effect)
+    print(f"\ntables and figures are in {out}")
+    painters = e.workers if e.cluster is None else usable_cores()
+    problems = film.produce(recordings, out / "films", painters) if recordings else []
+    try:
+        print(f"all of it on one page: {report.write(out)}")
+    except OSError as error:
+        problems.append(f"no {report.NAME}: {error}")
+    return problems
 
 
 def print_effect(effect: dict[str, Any]) -> None:
@@ -264,147 +416,62 @@ def print_effect(effect: dict[str, Any]) -> None:
         print(f"of {found['tdgc']['n']} episodes {found['gained']} gained, {found['lost']} lost")
 
 
-def prepare(folder: Path, traced: bool, filmed: bool) -> None:
-    """Make room for results: what an earlier run left and this one may not write goes away."""
-    films = (old for kind in ("film", "sheet", "strip") for old in folder.glob(f"films/{kind}_*"))
-    others = (folder / name for name in ("diagnosis.csv", "tuning.json", report.NAME))
-    for old in (*folder.glob("traces/*.parquet"), *films, *others):
-        old.unlink(missing_ok=True)
-    if filmed:
-        (folder / "films").mkdir(exist_ok=True)
-    if traced:
-        (folder / "traces").mkdir(exist_ok=True)
+def run_tracking(evaluation: Evaluation, low: Policy) -> None:
+    """Measure the low policy alone, print what is found and write tracking.json."""
+    e = evaluation
+    result = tracking(low, e.episodes, e.seed, e.workers, e.spread)
+    (e.out / "tracking.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
+    print("gait    velocity RMSE  yaw rate RMSE  contact match")
+    for gait, r in result["gaits"].items():
+        print(
+            f"{gait:<8}{r['velocity_rmse']:9.3f} m/s{r['yaw_rate_rmse']:9.3f} rad/s"
+            f"{100 * r['contact_match']:13.1f} %"
+        )
+    print(f"{result['falls_per_10_min']:.2f} falls in 10 minutes ({result['minutes']:.1f} walked)")
 
 
-def run_table(
-    low: Policy,
-    drivers: Mapping[str, Driver],
-    cells: list[Cell],
-    args: argparse.Namespace,
-    traced: Selection | None = None,
-    tuned: Tuning | None = None,
-) -> int:
-    """Run all cells and write everything; the exit status, 1 where a film or report is missing."""
-    work = functools.partial(
-        run_one, low=low, drivers=drivers, seed=args.seed, filmed=args.video, traced=traced
-    )
-    share_out = spread if args.cluster is None else cluster.spread
-    episodes: list[Episode] = []
-    recordings: list[Recording] = []
-    diagnoses: list[Diagnosis] = []
-    with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
-        for rows, recorded, failures, traces in share_out(work, cells, args.workers):
-            for trace in traces:
-                write(trace, args.out / "traces")
-            episodes += rows
-            recordings += recorded
-            diagnoses += failures
-            bar.update(len(rows))
-    summary = write_results(args.out, episodes)
-    plots.success_by_level(args.out / "summary.json", args.out / "success.png")
-    plots.gait_shares(args.out, args.out / "gaits.png")
-    plots.headings(args.out, args.out / "headings.png")
-    plots.trajectories(args.out, args.out / "trajectories.png")
-    print_table(summary)
-    if traced is not None:
-        diagnosis.write(diagnoses, args.out / "diagnosis.csv")
-        print(f"\n{diagnosis.describe(diagnoses, episodes)}")
-    if tuned is not None:
-        effect = tuning.compare(episodes, "tdgc", TUNED)
-        result = {"tuning": tuning.record(tuned), "effect": effect}
-        (args.out / "tuning.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
-        print_effect(effect)
-    print(f"\ntables and figures are in {args.out}")
-    painters = args.workers if args.cluster is None else usable_cores()
-    problems = film.produce(recordings, args.out / "films", painters) if recordings else []
+def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> None:
+    """Show a robot on the first tile of the first family and level, until the window is closed."""
+    policy, driver = next(iter(drivers.items()))
+    cell = Cell(policy, "nominal", evaluation.families[0], evaluation.levels[0], 0, 1)
     try:
-        print(f"all of it on one page: {report.write(args.out)}")
-    except OSError as error:
-        problems.append(f"no {report.NAME}: {error}")
-    for problem in problems:
-        print(f"evaluate.py: {problem}", file=sys.stderr)
-    return 1 if problems else 0
-
-
-def run_gui(
-    low: Policy, drivers: Mapping[str, Driver], cell: Cell, args: argparse.Namespace
-) -> int:
-    try:
-        if args.gui == "drive":
-            gui.drive(low, cell, args.seed)
+        if evaluation.mode == "drive":
+            gui.drive(low, cell, evaluation.seed)
         else:
-            gui.watch(low, drivers[cell.policy], cell, args.seed)
-    except WindowError as error:
-        print(f"evaluate.py: {error}", file=sys.stderr)
-        return 2
+            gui.watch(low, driver, cell, evaluation.seed)
     except KeyboardInterrupt:
         pass  # as good an end as closing the window
-    return 0
 
 
 def main(arguments: list[str] | None = None) -> int:
-    args = parse(arguments)
-    shipped = SHIPPED_HIGH.with_suffix(".json").is_file()
-    high = args.high or (SHIPPED_HIGH if shipped else None)
+    def fail(error: object) -> None:
+        print(f"evaluate.py: {error}", file=sys.stderr)
+
     try:
-        levels = choose_levels(args.levels)
-        maps = tuple(name for name in args.families.split(",") if is_map(name))
-        families = choose(args.families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
-        for name in maps:
-            height_map(name)
-        default = "gp" if high is None else "all"
-        names = choose(args.policies or default, (*POLICIES, TEACHER), POLICIES, "policy")
-        conditions = choose(args.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition")
-        met = (*families, *(name for name in conditions if name in ALL_FAMILIES))
-        if TEACHER in names and not set(met) <= set(STYLES):
-            strange = next(name for name in met if name not in STYLES)
-            known = ", ".join(STYLES)
-            raise ValueError(f"the {TEACHER} knows {known}; it cannot lead on {strange}")
-        if args.gui is not None and args.cluster is not None:
-            raise ValueError("--gui shows a robot of this machine: no --cluster")
-        cores = usable_cores() if args.cluster is None else cluster.connect(args.cluster)
-        if args.workers == "auto":
-            args.workers = cores
-        for flag, value in (("--episodes", args.episodes), ("--workers", args.workers)):
-            if value < 1:
-                raise ValueError(f"{flag} must be at least 1, not {value}")
-        if not 0 <= args.seed < 2**32:
-            raise ValueError(f"--seed must lie in [0, 2**32), not {args.seed}")
-        traced = Selection.parse(args.trace) if args.trace is not None else None
-        if traced is not None:
-            check_installed()
-        tuned = load_tuning(args)
-        if not 0 <= args.video <= args.episodes:
-            raise ValueError(f"--video must lie in [0, --episodes], not {args.video}")
-        if args.gui is not None and (args.tracking or args.video or traced is not None):
-            raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
-        if args.tracking and args.video:
-            raise ValueError("--tracking has no episodes to film: no --video")
-        if args.tracking and (traced is not None or tuned is not None):
-            raise ValueError("--tracking is of the low level alone: no --trace, --tune or --set")
-        low, config = load_low(args.low)
+        evaluation = Evaluation.of(parse(arguments))
+        low, config = load_low(evaluation.low)
         read_geometry(config.robot)  # before the results of an earlier call are removed
-        drivers = {} if args.tracking else make_drivers(names, high, low, config, tuned)
-        args.out.mkdir(parents=True, exist_ok=True)
-        if not args.tracking and args.gui is None:
-            prepare(args.out, traced is not None, args.video > 0)
+        drivers = evaluation.drivers(low, config)
+        evaluation.make_room()
     except (ValueError, OSError) as error:
-        print(f"evaluate.py: {error}", file=sys.stderr)
+        fail(error)
         return 2
-    if args.gui is not None:
-        first = Cell(next(iter(drivers)), "nominal", families[0], levels[0], 0, 1)
-        return run_gui(low, drivers, first, args)
+    problems: list[str] = []
     try:
-        if args.tracking:
-            return run_tracking(low, args)
-        cells = plan(list(drivers), conditions, families, levels, args.episodes)
-        return run_table(low, drivers, cells, args, traced, tuned)
-    except ConfigError as error:  # a robot that Bullet cannot load
-        print(f"evaluate.py: {error}", file=sys.stderr)
+        if evaluation.mode == "tracking":
+            run_tracking(evaluation, low)
+        elif evaluation.mode == "table":
+            problems = run_table(evaluation, low, drivers)
+        else:
+            run_window(evaluation, low, drivers)
+    except (ConfigError, WindowError) as error:  # Bullet cannot load the robot, or has no window
+        fail(error)
         return 2
     except WorkerError as error:
-        print(f"evaluate.py: {error}", file=sys.stderr)
-        return 1
+        problems = [str(error)]
+    for problem in problems:
+        fail(problem)
+    return 1 if problems else 0
 
 
 if __name__ == "__main__":

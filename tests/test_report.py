@@ -43,7 +43,7 @@ def write_mp4(path: Path) -> None:
         file.mux(stream.encode())
 
 
-def write_table(folder: Path) -> None:
+def write_table(folder: Path, reached_by: dict[str, int] = REACHED) -> None:
     """Ten episodes a policy on the gaps of level 8, and one each with pushes."""
     tile = {"family": "gap", "level": 8, "seed": 3}
     walk = {"path_m": 5.25, "energy_j": 500.0, "shares": (1.0, 0.0, 0.0, 0.0)}
@@ -53,7 +53,7 @@ def write_table(folder: Path) -> None:
             policy, condition, episode=k, outcome="reached" if k < reached else "fell",
             time_s=9.5, **tile, **walk, **way,
         )
-        for policy, reached in REACHED.items()
+        for policy, reached in reached_by.items()
         for condition, count in (("nominal", 10), ("pushes", 1))
         for k in range(count)
     ]  # fmt: skip
@@ -147,6 +147,18 @@ def test_rates_have_their_intervals(page: Path) -> None:
     assert ["family", "level 8", "mean"] in rows
     assert ["gap", seven, seven] in rows and ["gap", none, none] in rows
     assert ["tdgc", "7", "3", "0", "0", "0"] in rows  # outcomes
+
+
+def test_paired_differences_and_where_dominance_fails(tmp_path: Path) -> None:
+    write_table(tmp_path)
+    assert "on the same tiles" not in Reader(report.render(tmp_path)).text
+    write_table(tmp_path, {"tdgc": 0, "gp": 10})
+    reader = Reader(report.render(tmp_path))
+    assert ["condition", "gap", "mean"] in reader.rows
+    # Of ten tiles all are lost: Wilson's 0 to 0.278 and 0.722 to 1, squared and added.
+    lost = "-100.0 below gp -100.0 to -60.8"
+    assert ["nominal", lost, lost] in reader.rows
+    assert ["pushes", *["-100.0 -100.0 to +12.2"] * 2] in reader.rows  # one tile says little
 
 
 def test_diagnosis_tuning_and_conditions(page: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,10 @@ from typing import Any
 import numpy as np
 
 from tdgc.benchmark.evaluation import Episode
+
+#: Key of summary.json beside the policies: "tdgc - gp" -> ``compare``.
+PAIRED = "paired"
+_PAIR = ("tdgc", "gp")  # the rule of dominance (TDGC-Bench): the first is nowhere below the second
 
 
 def wilson_interval(reached: int, n: int, z: float = 1.959964) -> tuple[float, float]:
@@ -21,6 +26,81 @@ def wilson_interval(reached: int, n: int, z: float = 1.959964) -> tuple[float, f
     centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * np.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     return max(0.0, float(centre - half)), min(1.0, float(centre + half))
+
+
+def paired_interval(
+    both: int, first: int, second: int, neither: int, z: float = 1.959964
+) -> tuple[float, float]:
+    """Interval of the difference of two rates on the same tiles, the first's less the second's.
+
+    95 % by default: method 10 of Newcombe (1998, Statistics in Medicine 17, 2635-2650), which joins
+    the Wilson intervals of both rates by their correlation.
+
+    Args:
+        both, first, second, neither: number of tiles on which both succeeded, only the first, only
+            the second, neither.
+        z: quantile of the normal distribution.
+    """
+    n = both + first + second + neither
+    one, other = (both + first) / n, (both + second) / n
+    one_low, one_high = wilson_interval(both + first, n, z)
+    other_low, other_high = wilson_interval(both + second, n, z)
+    together = float(both * neither - first * second)
+    if together > 0:  # Newcombe's continuity correction
+        together = max(together - n / 2, 0.0)
+    spread = (both + first) * (second + neither) * (both + second) * (first + neither)
+    correlation = together / spread**0.5 if spread else 0.0
+
+    def half(a: float, b: float) -> float:
+        return max(a * a - 2.0 * correlation * a * b + b * b, 0.0) ** 0.5
+
+    return (
+        one - other - half(one - one_low, other_high - other),
+        one - other + half(one_high - one, other - other_low),
+    )
+
+
+def difference(tiles: Iterable[tuple[bool, bool]]) -> dict[str, float]:
+    """Of tiles, each with whether the first and the second policy reached the goal: how many (n),
+    gained and lost (only the first, only the second reached it), the ``difference`` of the rates
+    and its interval ci_low, ci_high."""
+    found = Counter(tiles)
+    n, gained, lost = found.total(), found[True, False], found[False, True]
+    low, high = paired_interval(found[True, True], gained, lost, found[False, False])
+    return {
+        "n": n,
+        "gained": gained,
+        "lost": lost,
+        "difference": (gained - lost) / n,
+        "ci_low": low,
+        "ci_high": high,
+    }
+
+
+def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, Any]:
+    """condition -> family -> ``difference`` of two policies on the same tiles, and "mean" over
+    the families.
+
+    Raises:
+        ValueError: a tile that only one of them was on.
+    """
+    reached: dict[str, dict[tuple[str, str, int, int], bool]] = {first: {}, second: {}}
+    for e in episodes:
+        if e.policy in reached:
+            where = e.condition, e.family, e.level, e.episode
+            reached[e.policy][where] = e.outcome == "reached"
+    if reached[first].keys() != reached[second].keys():
+        raise ValueError(f"{first} and {second} were not on the same tiles")
+    tree: dict[str, Any] = {}
+    for where, one in reached[first].items():
+        condition, family, *_ = where
+        tiles = tree.setdefault(condition, {}).setdefault(family, [])
+        tiles.append((one, reached[second][where]))
+    for families in tree.values():
+        every = [tile for tiles in families.values() for tile in tiles]
+        families.update({family: difference(tiles) for family, tiles in families.items()})
+        families["mean"] = difference(every)
+    return tree
 
 
 def success(rows: Sequence[Episode]) -> dict[str, float]:
@@ -53,6 +133,46 @@ def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:
     return tree
 
 
+def describe(summary: dict[str, Any]) -> str:
+    """A summary for the terminal: rates by family and level with their means, then the paired
+    differences in points of success, and where the first policy is below the second."""
+    lines: list[str] = []
+    for policy, conditions in summary.items():
+        if policy != PAIRED:
+            for condition, families in conditions.items():
+                lines += ["", f"{policy}, {condition}", *_rates(families)]
+    for pair, conditions in summary.get(PAIRED, {}).items():
+        for condition, families in conditions.items():
+            lines += ["", f"{pair} on the same tiles, {condition}"]
+            wide = max(8, *(len(name) + 1 for name in families))
+            for family, found in families.items():
+                points, low, high = (
+                    100 * found[key] for key in ("difference", "ci_low", "ci_high")
+                )
+                text = f"{family.ljust(wide)}{points:+6.1f}  [{low:+.1f}, {high:+.1f}]"
+                lines.append(f"{text}  {verdict(pair, found)}".rstrip())
+    return "\n".join(lines)
+
+
+def verdict(pair: str, found: dict[str, float]) -> str:
+    """What a ``difference`` says of the rule of dominance: "below gp", or nothing to say."""
+    return f"below {pair.rpartition(' ')[-1]}" if found["ci_high"] < 0.0 else ""
+
+
+def _rates(families: dict[str, Any]) -> list[str]:
+    names = [f for f in families if f != "mean"]
+    levels = list(families[names[0]])
+    wide = max(8, *(len(name) + 1 for name in names))
+    lines = ["family".ljust(wide) + "".join(f"{level:>8}" for level in levels)]
+    for name in names:
+        cells = "".join(f"{100 * families[name][level]['rate']:7.1f}%" for level in levels)
+        lines.append(name.ljust(wide) + cells)
+    mean = families["mean"]
+    rate, low, high = (100 * mean[key] for key in ("rate", "ci_low", "ci_high"))
+    lines.append(f"{'mean'.ljust(wide)}{rate:.1f} %  [{low:.1f}, {high:.1f}]  n={mean['n']}")
+    return lines
+
+
 def write_results(folder: Path, episodes: Sequence[Episode]) -> dict[str, Any]:
     """Write episodes.csv, summary.json and trajectories.npz into ``folder``; returns the summary.
 
@@ -70,5 +190,7 @@ def write_results(folder: Path, episodes: Sequence[Episode]) -> dict[str, Any]:
         goals=np.array([e.goal for e in episodes], dtype=np.float32),
     )
     summary = summarise(episodes)
+    if set(_PAIR) <= summary.keys():
+        summary[PAIRED] = {" - ".join(_PAIR): compare(episodes, *_PAIR)}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
     return summary

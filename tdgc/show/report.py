@@ -28,6 +28,7 @@ from tdgc.benchmark.evaluation import (
     Condition,
     EpisodeRecord,
 )
+from tdgc.benchmark.results import PAIRED, verdict
 from tdgc.sim.terrain import file_label
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
@@ -289,6 +290,8 @@ def render(folder: Path) -> str:
         ValueError: a file holds what an evaluation does not write.
     """
     summary, episodes = _json(folder / "summary.json"), _rows(folder / "episodes.csv")
+    paired = summary.pop(PAIRED, {})
+    names = [family for pair in paired.values() for found in pair.values() for family in found]
     has_diagnoses = (folder / "diagnosis.csv").is_file()
     diagnoses = _rows(folder / "diagnosis.csv") if has_diagnoses else []
     films = folder / "films"
@@ -306,6 +309,9 @@ def render(folder: Path) -> str:
         seeds=_distinct(episodes, "seed"),
         count=len(episodes),
         summary=summary,
+        paired=paired,
+        paired_families=sorted(dict.fromkeys(names), key=lambda name: name == "mean"),
+        verdict=verdict,
         conditions=_conditions(episodes),
         outcomes=OUTCOMES,
         figures=[(data_uri(folder / name), title, alt) for name, title, alt in FIGURES],

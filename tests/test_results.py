@@ -1,0 +1,115 @@
+"""Rates, their intervals, paired differences, and the files of a results folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tdgc.benchmark.evaluation import Episode
+from tdgc.benchmark.results import (
+    compare,
+    describe,
+    paired_interval,
+    summarise,
+    wilson_interval,
+    write_results,
+)
+
+
+def row(policy: str, family: str, level: int, episode: int, outcome: str) -> Episode:
+    nothing, shares = np.zeros((1, 3)), (1.0, 0.0, 0.0, 0.0)
+    where = (policy, "nominal", family, level, episode, 0)
+    return Episode(*where, outcome, 1.0, 1.0, 1.0, shares, nothing[0, :2], nothing)
+
+
+def rows(policy: str, family: str, reached: list[bool]) -> list[Episode]:
+    ends = ["reached" if good else "fell" for good in reached]
+    return [row(policy, family, 6, k, end) for k, end in enumerate(ends)]
+
+
+def test_wilson_interval_is_the_textbook_one() -> None:
+    # Wilson's interval of 8 in 10 at 95 %: 0.4902 to 0.9433 (e.g. Newcombe 1998, method 3).
+    low, high = wilson_interval(8, 10)
+    assert low == pytest.approx(0.4902, abs=5e-5) and high == pytest.approx(0.9433, abs=5e-5)
+    assert wilson_interval(0, 20)[0] == 0.0 and wilson_interval(20, 20)[1] == 1.0
+    with pytest.raises(ValueError, match=r"0 <= reached <= n"):
+        wilson_interval(3, 2)
+
+
+def test_paired_interval_is_newcombes() -> None:
+    # Airway hyper-responsiveness before and after a transplantation, 21 patients, as Fagerland,
+    # Lydersen and Laake (2014) work it out: -0.286, from -0.507 to -0.026.
+    low, high = paired_interval(1, 1, 7, 12)
+    assert (low, high) == pytest.approx((-0.507, -0.026), abs=5e-4)
+    # The other way round, and never beyond the possible.
+    assert paired_interval(1, 7, 1, 12) == pytest.approx((-high, -low))
+    assert paired_interval(0, 20, 0, 0) == pytest.approx((0.7721, 1.0), abs=5e-5)
+    low, high = paired_interval(100, 0, 0, 0)
+    assert low == pytest.approx(-high) and 0.03 < high < 0.06
+
+
+def test_paired_interval_covers_the_truth() -> None:
+    """Of 2,000 tables of 100 tiles drawn with success of 0.95 and 0.9 that go together."""
+    rng = np.random.default_rng(0)
+    tables = rng.multinomial(100, [0.88, 0.07, 0.02, 0.03], 2000)
+    inside = [low <= 0.05 <= high for low, high in (paired_interval(*map(int, t)) for t in tables)]
+    assert 0.94 <= np.mean(inside) <= 0.98
+
+
+def test_summary_counts_and_averages() -> None:
+    table = summarise(
+        [
+            row("gp", "rough", 6, 0, "reached"), row("gp", "rough", 6, 1, "fell"),
+            row("gp", "rough", 7, 0, "reached"), row("gp", "rough", 7, 1, "reached"),
+            row("gp", "gap", 6, 0, "timeout"), row("gp", "gap", 6, 1, "left_tile"),
+            row("gp", "gap", 7, 0, "collided"), row("gp", "gap", 7, 1, "reached"),
+        ]
+    )["gp"]["nominal"]  # fmt: skip
+    assert table["rough"]["6"]["rate"] == 0.5 and table["rough"]["mean"]["rate"] == 0.75
+    assert table["gap"]["mean"]["reached"] == 1
+    assert table["mean"]["n"] == 8 and table["mean"]["rate"] == 0.5
+    assert table["mean"]["ci_low"] < 0.5 < table["mean"]["ci_high"]
+
+
+#: tdgc gains three of ten tiles of rough and loses one; of 40 of gap it loses 30.
+EPISODES = [
+    *rows("tdgc", "rough", [True] * 6 + [False] * 1 + [False] * 3),
+    *rows("gp", "rough", [True] * 3 + [False] * 3 + [True] * 1 + [False] * 3),
+    *rows("tdgc", "gap", [True] * 10 + [False] * 30),
+    *rows("gp", "gap", [True] * 40),
+]
+
+
+def test_differences_are_paired_by_tile() -> None:
+    found = compare(reversed(EPISODES), "tdgc", "gp")["nominal"]
+    assert list(found) == ["gap", "rough", "mean"]
+    rough = {key: found["rough"][key] for key in ("n", "gained", "lost", "difference")}
+    assert rough == {"n": 10, "gained": 3, "lost": 1, "difference": pytest.approx(0.2)}
+    interval = found["rough"]["ci_low"], found["rough"]["ci_high"]
+    assert interval == paired_interval(3, 3, 1, 3)
+    assert found["gap"]["difference"] == pytest.approx(-0.75) and found["gap"]["ci_high"] < -0.5
+    assert found["mean"]["n"] == 50 and found["mean"]["difference"] == pytest.approx(-28 / 50)
+    with pytest.raises(ValueError, match="tdgc and gp were not on the same tiles"):
+        compare(EPISODES[1:], "tdgc", "gp")
+
+
+def test_the_summary_has_the_differences_beside_the_policies(tmp_path: Path) -> None:
+    write_results(tmp_path, EPISODES)
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert list(summary) == ["tdgc", "gp", "paired"]
+    assert summary["paired"] == {"tdgc - gp": compare(EPISODES, "tdgc", "gp")}
+    write_results(tmp_path, [e for e in EPISODES if e.policy == "gp"])
+    assert list(json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))) == ["gp"]
+
+
+def test_the_table_says_where_dominance_fails(tmp_path: Path) -> None:
+    lines = describe(write_results(tmp_path, EPISODES)).splitlines()
+    at = lines.index("tdgc - gp on the same tiles, nominal")
+    low, high = (100 * end for end in paired_interval(3, 3, 1, 3))
+    assert lines[at + 1].split() == ["rough", "+20.0", f"[{low:+.1f},", f"{high:+.1f}]"]
+    assert lines[at + 2].startswith("gap") and lines[at + 2].endswith("  below gp")
+    assert lines[at + 3].startswith("mean") and lines[at + 3].endswith("  below gp")
+    assert lines[1] == "tdgc, nominal" and "paired" not in lines
