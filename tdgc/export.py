@@ -64,7 +64,9 @@ from tdgc.sim.robot import (
     Array,
     action_scale,
     foot_kinematics,
+    nominal_height,
     nominal_pose,
+    pd_torque,
     target_limits,
 )
 from tdgc.sim.terrain import TileField, make_tile
@@ -433,9 +435,7 @@ def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
     """What the two interface files say, by graph; ``tdgc.deploy`` has their schema."""
     config, task = pair.low_config, pair.high_config
     robot, physics = config.robot, config.physics
-    geometry, pose = read_geometry(robot), nominal_pose(robot)
-    feet, _ = foot_kinematics(geometry, pose[None], np.zeros((1, NUM_JOINTS)))
-    urdf = urdf_path(robot)
+    geometry, urdf = read_geometry(robot), urdf_path(robot)
     joint_hz = physics.joint_steps / physics.control_dt
     gaits = [
         {"name": gait, **dict(zip(NAMES[12:], row, strict=True))}
@@ -457,8 +457,8 @@ def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
             "standing_height": _quantity("m", robot.base_height),
         },
         "start": {
-            "joint_angles": _quantity("rad", pose.tolist()),
-            "trunk_height": _quantity("m", geometry.foot_radius - float(feet[0, :, 2].min())),
+            "joint_angles": _quantity("rad", nominal_pose(robot).tolist()),
+            "trunk_height": _quantity("m", nominal_height(robot, geometry)),
         },
         "joint_control": {
             "law": "torque = kp (target - angle) - kd speed, within the torque limit; 0 where it "
@@ -602,7 +602,7 @@ class Check:
 def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     """Let the graphs in ``folder`` drive a robot for as long as an episode, policies beside them.
 
-    What drives is read from the folder alone: start, sensors, probes, task and joint control. The
+    What drives is read from the folder alone: sensors, probes, task, order and joint control. The
     policies see the same robot through the simulator's own observation, with their own
     configurations, clock and LSTM state. A robot that falls, leaves its tile or reaches its goal
     starts again.
@@ -634,7 +634,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
                 controller.reset()
                 loco.command[:] = default_command()
                 loco.place(np.arange(1), start[:, :2], start[:, 2], np.zeros(1))
-                controller.place(world, start[0])
+                differences.append(world.state.q[0] - nominal_pose(world.robot))
                 driver.begin(loco, goal, _CHECKED_ON)
                 step = 0
             readings = controller.sense(world.state, goal[0], _CHECKED_ON, field.height_at)
@@ -646,12 +646,18 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
             loco.command[:] = controller.commands
             wanted = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
             action = controller.low.values["action"]
+            error, speed = targets - world.state.q, world.state.qd
+            told, torque = (
+                pd_torque(error, speed, world.strength, robot)
+                for robot in (world.robot, config.robot)
+            )
             loco.act(action[None])
             differences += [
                 decision - driver.action[0],
                 controller.commands - decoder.decode(decision),
                 action - wanted[0],
                 targets - loco.targets[0, 0],
+                told[0] - torque[0],
             ]
             step += 1
             ended = bool(outcome(world, goal)[0] != GOING)

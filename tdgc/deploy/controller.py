@@ -25,8 +25,7 @@ from tdgc.config import CommandRanges, RobotConfig, read_json
 from tdgc.errors import InputError, install_hint
 from tdgc.sim.commands import CONTINUOUS
 from tdgc.sim.geometry import JOINTS, read_geometry
-from tdgc.sim.robot import NUM_JOINTS, Array, RobotState, nominal_pose, yaw_quaternion
-from tdgc.sim.world import World
+from tdgc.sim.robot import NUM_JOINTS, Array, RobotState, nominal_height, nominal_pose
 
 #: Formats of graphs and the suffixes of their files.
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
@@ -340,17 +339,6 @@ class Controller:
 
     # ------------------------------------------------------------------ the robot
 
-    def place(self, world: World, start: Array) -> None:
-        """Stand the one robot of ``world`` at ``start`` (3,), x, y in m and yaw in rad, as the
-        interface has an episode begin."""
-        begin = self.low.table["start"]
-        pose = np.array([begin["joint_angles"]["value"]])
-        position, turn = np.array([[start[0], start[1], 0.0]]), yaw_quaternion(start[2:])
-        world.reset_robots([0], position, turn, pose)
-        x, y, _ = world.state.foot_position[0].T
-        position[:, 2] = world.ground_height(x, y).max() + begin["trunk_height"]["value"]
-        world.reset_robots([0], position, turn, pose)
-
     def robot(self, urdf: Path | None = None) -> RobotConfig:
         """The robot of the interface for this package's own simulation; its ``urdf`` is the copy in
         the folder by default.
@@ -374,13 +362,14 @@ class Controller:
             nominal_thigh=(thigh, pose[7]),
             nominal_calf=calf,
             base_height=table["robot"]["standing_height"]["value"],
+            joint_margin=control["target_margin"]["value"],
         )
         for what, told, taken in (
             ("kp", control["kp"]["value"], [config.kp] * NUM_JOINTS),
             ("kd", control["kd"]["value"], [config.kd] * NUM_JOINTS),
             ("torque_limit", control["torque_limit"]["value"], config.torque_limit * 4),
             ("speed_limit", control["speed_limit"]["value"], config.speed_limit * 4),
-            ("start pose", pose, nominal_pose(config)),
+            ("the start pose", pose, nominal_pose(config)),
         ):
             if not np.array_equal(told, taken):
                 raise ExportError(f"{what} differs from leg to leg: {told}, not {list(taken)}")
@@ -402,5 +391,8 @@ class Controller:
             mine, wanted = geometry.masses.get(link, 0.0), masses.get(link, 0.0)
             if mine != wanted:
                 raise ExportError(f"{wrong}: link {link} has {mine:g} kg, that robot's {wanted:g}")
+        height, wanted = nominal_height(config, geometry), table["start"]["trunk_height"]["value"]
+        if not np.isclose(height, wanted, rtol=0.0, atol=1e-9):
+            raise ExportError(f"{wrong}: starts {height:g} m high, that robot {wanted:g}")
         if checksum(urdf) != table["robot"]["urdf"]["sha256"]:
             raise ExportError(f"{wrong}: joint limits and masses agree, its checksum does not")

@@ -22,6 +22,7 @@ from tdgc.sim.robot import (
     commanded_pose,
     foot_kinematics,
     joint_targets,
+    nominal_height,
     nominal_pose,
     yaw_quaternion,
 )
@@ -130,9 +131,9 @@ class Locomotion:
         self.payload = np.zeros(num_robots)
         self.armature = np.zeros(num_robots)
         geometry = self.world.state.geometry
-        # Feet in the nominal pose, (1, 4, 3) m, and how high the trunk is above their soles.
+        # Feet in the nominal pose, (1, 4, 3) m.
         self._feet, _ = foot_kinematics(geometry, self.nominal[None], np.zeros((1, NUM_JOINTS)))
-        self._stand = geometry.foot_radius - self._feet[0, :, 2].min()
+        self._stand = nominal_height(robot, geometry)
         self._pose = self._pose_of = np.empty(0)  # the last ``pose`` and what it followed from
 
     @property

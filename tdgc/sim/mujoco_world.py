@@ -7,20 +7,21 @@ the same PD law. Contacts, integration and the motors' rotors are MuJoCo's.
 from __future__ import annotations
 
 import contextlib
+import time
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
 from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, RobotState, pd_torque, rotation_matrix
 from tdgc.sim.terrain import TileField
-from tdgc.sim.world import GRAVITY, World, check_display
+from tdgc.sim.world import GRAVITY, WindowError, World, check_display
 
 _CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
 _NAME = "ground"
@@ -74,7 +75,8 @@ class MujocoConfig:
 class MujocoWorld(World):
     """One robot on the only tile of a field, simulated by MuJoCo instead of Bullet.
 
-    Of ``World`` it has the robot's ``state``, its placing and the ground's heights, no more.
+    It does what an episode asks of a ``World``. What training asks beyond that it cannot do: other
+    terrain, forgetting, pictures.
 
     Args:
         robot: its URDF, gains and limits.
@@ -96,7 +98,7 @@ class MujocoWorld(World):
         visual: bool = False,
     ) -> None:
         self.num_robots, self.robot, self.physics, self.field = 1, robot, physics, field
-        self.strength = np.ones((1, 1))
+        self.strength, self._active = np.ones((1, 1)), np.arange(1)
         self.state = RobotState.zeros(read_geometry(robot), 1)
         self.model = _build(robot, field, config, visual)
         self.data = mujoco.MjData(self.model)
@@ -104,6 +106,9 @@ class MujocoWorld(World):
         self._q = np.array([joint.qposadr[0] for joint in joints])
         self._qd = np.array([joint.dofadr[0] for joint in joints])
         self._part = self._parts()
+        trunk = self.model.body(1)
+        self._trunk = trunk.mass.copy(), trunk.inertia.copy()
+        self._armature = config.armature
 
     def _parts(self) -> NDArray[np.int64]:
         """What each geom is part of, as codes of this module."""
@@ -125,17 +130,36 @@ class MujocoWorld(World):
         state, data = self.state, self.data
         mujoco.mj_resetData(self.model, data)
         data.qpos[:3], data.qpos[3:7] = state.position[i], np.roll(state.quaternion[i], 1)
-        data.qvel[:3], data.qvel[3:6] = state.lin_vel[i], state.rotation[i].T @ state.ang_vel[i]
         data.qpos[self._q], data.qvel[self._qd] = state.q[i], state.qd[i]
-        mujoco.mj_forward(self.model, data)
+        self._move_trunk(i)
 
-    def control(self, targets: Array) -> None:
-        """One control step of PD control to the joint targets (12,) rad; refreshes ``state``."""
+    def _move_trunk(self, i: int) -> None:
+        """Let the trunk move as ``state`` has it."""
+        state, velocity = self.state, self.data.qvel
+        turn = rotation_matrix(state.quaternion)[i].T
+        velocity[:3], velocity[3:6] = state.lin_vel[i], turn @ state.ang_vel[i]
+
+    def set_dynamics(
+        self, index: ArrayLike, friction: Array, payload: Array, armature: Array
+    ) -> None:
+        """As ``World.set_dynamics``; ``armature`` (1,) kg m^2 comes on top of the settings'."""
+        model, (mass, inertia) = self.model, self._trunk
+        share = (mass + payload) / mass  # spread over the trunk, the payload scales its inertia
+        model.body(1).mass, model.body(1).inertia = share * mass, share * inertia
+        model.geom_friction[:, 0] = friction[0]  # of two in contact MuJoCo takes the larger
+        model.dof_armature[self._qd] = self._armature + armature
+        mujoco.mj_setConst(model, self.data)
+
+    def retire(self, index: ArrayLike) -> None:
+        """The robot's episode has ended, and this world has no other robot."""
+
+    def step(self, targets: Array, delay: Array, offset: Array) -> None:
+        """One control step of PD control, as ``World.step``."""
         model, data, state = self.model, self.data, self.state
-        state.trunk_force[0] = 0.0
-        for _ in range(self.physics.joint_steps):
-            error, speed = targets - data.qpos[self._q], data.qvel[self._qd]
-            state.torque = pd_torque(error[None], speed[None], self.strength, self.robot)
+        state.trunk_force = np.zeros(1)
+        for target in self._wanted(targets, delay, offset):
+            error, speed = target - data.qpos[self._q], data.qvel[self._qd]
+            state.torque = pd_torque(error, speed[None], self.strength, self.robot)
             data.qfrc_applied[self._qd] = state.torque[0]
             for _ in range(self.physics.hold):
                 mujoco.mj_step(model, data)
@@ -156,12 +180,6 @@ class MujocoWorld(World):
             mujoco.mj_contactForce(self.model, self.data, k, wrench)
             force[part] += wrench[0]
         return force
-
-    def deepest(self) -> float:
-        """How far a foot is under the surface, m; 0 or less if none is."""
-        feet = self.state.foot_position[0]
-        ground = self.ground_height(feet[:, 0], feet[:, 1])
-        return float((ground - feet[:, 2]).max() + self.state.geometry.foot_radius)
 
     def close(self) -> None:
         """Nothing of MuJoCo needs to be closed."""
@@ -248,17 +266,36 @@ def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
         joint.solref_limit = [config.solref, 1.0]
 
 
-@contextlib.contextmanager
-def window(world: MujocoWorld) -> Iterator[Any]:
-    """MuJoCo's viewer on ``world``; ``sync`` it after each control step.
+class Window:
+    """A ``Watcher`` that shows an episode in MuJoCo's viewer, as fast as it happens.
 
     Raises:
-        WindowError: no display.
+        WindowError: no display, or the window was closed.
     """
-    from mujoco import viewer
 
-    check_display()
-    with viewer.launch_passive(world.model, world.data) as shown:
-        shown.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-        shown.cam.trackbodyid, shown.cam.distance = 1, 2.0
-        yield shown
+    def __init__(self) -> None:
+        self._open = contextlib.ExitStack()
+
+    def __enter__(self) -> Window:
+        check_display()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.close()
+
+    def begin(self, cell: object, loco: Locomotion, field: TileField, goal: Array) -> None:
+        from mujoco import viewer
+
+        world = loco.world
+        assert isinstance(world, MujocoWorld)
+        self._dt, self._due = world.physics.control_dt, time.perf_counter()
+        self._shown = self._open.enter_context(viewer.launch_passive(world.model, world.data))
+        self._shown.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        self._shown.cam.trackbodyid, self._shown.cam.distance = 1, 2.0
+
+    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+        if not self._shown.is_running():
+            raise WindowError("the window was closed")
+        self._shown.sync()
+        self._due += self._dt
+        time.sleep(max(0.0, self._due - time.perf_counter()))
