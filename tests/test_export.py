@@ -2,10 +2,12 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -16,7 +18,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
-from tdgc.deploy.controller import FORMATS, Graph
+from tdgc.deploy.controller import FORMATS, ExportError, Graph
 from tdgc.export import TOLERANCE, HighLevel, LowLevel
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
@@ -37,6 +39,7 @@ from tdgc.tasks.probes import height_probes
 LOW = PRETRAINED / "low"
 LOW_POLICY, LOW_CONFIG = load_low(LOW)
 HIGH_CONFIG = HighLevelConfig(commands=LOW_CONFIG.commands)
+TURNED = {"unit": "rad", "value": (nominal_pose(LOW_CONFIG.robot) + 0.01).tolist()}
 
 
 def unbounded(size: int) -> spaces.Box:
@@ -310,6 +313,47 @@ def test_check_finds_other_weights(tmp_path: Path) -> None:
     pair.high.tensors["actor.0.weight"].mul_(1.001)
     export.write(pair, tmp_path, ["torchscript"])
     assert export.check(tmp_path, "torchscript", LOW, other).difference > TOLERANCE
+
+
+def without_sources(table: dict[str, Any]) -> None:
+    """Forget which inputs come from the other graph."""
+    for signal in table["inputs"]:
+        signal["source"] = None
+
+
+@pytest.mark.parametrize(
+    ("graph", "change", "refused"),
+    [
+        ("low", lambda t: t["frames"]["gravity_when_level"].update(value=[0.0, 0.0, 1.0]), ""),
+        ("low", lambda t: t["joint_control"]["kp"].update(value=[21.0] * 12), ""),
+        ("low", lambda t: t["joint_control"]["kd"].update(value=[0.5] * 12), ""),
+        ("low", lambda t: t["rate"].update(value=25.0), ""),
+        ("low", lambda t: t["start"].update(joint_angles=TURNED), "the start pose differs"),
+        ("low", lambda t: t["start"]["trunk_height"].update(value=0.31), "m high"),
+        ("low", without_sources, "low: nothing gives its input 'commands'"),
+        ("high", without_sources, ""),
+        ("high", lambda t: t["order"].reverse(), "order["),
+        ("high", lambda t: t["order"][0].update(every=4), ""),
+        ("high", lambda t: t["probes"]["plane_below_trunk"].update(value=0.31), ""),
+        ("high", lambda t: t["probes"]["ahead_left"]["value"].reverse(), ""),
+        ("high", lambda t: t["families"].reverse(), ""),
+        ("high", lambda t: t["task"]["horizon"].update(value=2.0), ""),
+    ],
+)
+def test_check_finds_an_interface_that_says_something_else(
+    tmp_path: Path, graph: str, change: Callable[[dict[str, Any]], None], refused: str
+) -> None:
+    high = random_high(tmp_path / "high", dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0))
+    export.write(export.load_pair(LOW, high), tmp_path, ["torchscript"])
+    path = tmp_path / f"{graph}_interface.json"
+    table = json.loads(path.read_text())
+    change(table)
+    path.write_text(json.dumps(table))
+    if refused:
+        with pytest.raises(ExportError, match=re.escape(refused)):
+            export.check(tmp_path, "torchscript", LOW, high)
+    else:
+        assert export.check(tmp_path, "torchscript", LOW, high).difference > TOLERANCE
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -13,6 +13,7 @@ import hashlib
 import importlib.util
 import json
 import logging
+import textwrap
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -69,6 +70,8 @@ def read_interface(folder: Path, name: str) -> Table:
         ConfigError: no such file, or no JSON.
     """
     path = interface_path(folder, name)
+    from jsonschema.exceptions import best_match
+
     table = read_json(path)
     version = table.get("version") if isinstance(table, dict) else None
     if version != VERSION:
@@ -76,9 +79,11 @@ def read_interface(folder: Path, name: str) -> Table:
             f"{path}: an interface of version {version}, this package reads {VERSION}; export the "
             "policies again"
         )
-    error = next(_errors(table, name), None)
+    error = best_match(_validator(name).iter_errors(table))
     if error is not None:
-        raise ExportError(f"{path}: {error}")
+        where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in error.absolute_path)
+        said = textwrap.shorten(error.message, 200, placeholder="...")
+        raise ExportError(f"{path}: {where.removeprefix('.') or 'the interface'}: {said}")
     return dict(table)
 
 
@@ -86,16 +91,8 @@ def read_interface(folder: Path, name: str) -> Table:
 def _validator(name: str) -> Any:
     from jsonschema import Draft202012Validator
 
-    schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
-    return Draft202012Validator(schema | {"$ref": f"#/$defs/{name}"})
-
-
-def _errors(table: Table, name: str) -> Iterator[str]:
-    """What is wrong with an interface, a line each."""
-    for error in _validator(name).iter_errors(table):
-        place = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in error.absolute_path)
-        text = error.message if len(error.message) < 200 else f"{error.message[:200]}..."
-        yield f"{place.removeprefix('.') or 'the interface'}: {text}"
+    definitions = json.loads(SCHEMA.read_text(encoding="utf-8"))["$defs"]
+    return Draft202012Validator({"$defs": definitions, "$ref": f"#/$defs/{name}"})
 
 
 def checksum(path: Path) -> str:
@@ -128,7 +125,7 @@ class Graph:
     """
 
     def __init__(self, folder: Path, name: str, form: str) -> None:
-        self.table = read_interface(folder, name)
+        self._name, self.table = name, read_interface(folder, name)
         inputs = self.table["inputs"]
         self._inputs = [s["name"] for s in inputs]
         self._outputs = [s["name"] for s in self.table["outputs"]]
@@ -145,9 +142,15 @@ class Graph:
         """One step, inputs by name -> outputs by name; what else ``values`` holds does not matter.
 
         Inputs that come from the step before are in ``memory`` if not given.
+
+        Raises:
+            ExportError: an input that is neither given nor in ``memory``.
         """
         known = self.memory | values
-        inputs = [known[name] for name in self._inputs]
+        try:
+            inputs = [known[name] for name in self._inputs]
+        except KeyError as error:
+            raise ExportError(f"{self._name}: nothing gives its input {error}") from error
         started = time.thread_time()
         outputs = self._run(inputs)
         self.seconds = time.thread_time() - started

@@ -96,7 +96,8 @@ class LogWriter:
         self._note(readings, self._controller.count)
 
     def _note(self, row: dict[str, Array], step: int) -> None:
-        whole = {n: row.get(n, np.full(size, np.nan)) for n, size in self._layout.items()}
+        # Copies: a simulator may go on in the same arrays.
+        whole = {n: np.array(row.get(n, [np.nan] * k)) for n, k in self._layout.items()}
         self._rows.append(whole | {"time": np.array(step * self._controller.dt)})
 
     def save(self, path: Path) -> None:
