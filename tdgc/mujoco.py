@@ -13,7 +13,6 @@ import argparse
 import functools
 import json
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,9 +31,9 @@ from tdgc.benchmark.evaluation import (
     spread,
 )
 from tdgc.benchmark.flags import choose, choose_levels
-from tdgc.benchmark.recording import Recorder, Recording, Together
+from tdgc.benchmark.recording import Recorder, Recording
 from tdgc.benchmark.results import describe, write_results
-from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
+from tdgc.config import HighLevelConfig, LowLevelConfig, from_dict, to_dict, with_overrides
 from tdgc.deploy.controller import Controller, require
 from tdgc.deploy.log import LogWriter
 from tdgc.parallel.cores import usable_cores, workers_flag
@@ -62,27 +61,37 @@ class Deployed:
     """
 
     def __init__(self, controller: Controller, log: LogWriter | None = None) -> None:
-        self._controller, self._log = controller, log
-        self.config = HighLevelConfig(decimation=controller.decimation, commands=controller.bounds)
+        self.controller, self.log = controller, log
+        names = [signal["name"] for signal in controller.high.table["inputs"]]
+        cues = {"family": "semantic", "probes": "geometric"}
+        given = [cue for name, cue in cues.items() if name in names]
+        self.config = from_dict(
+            HighLevelConfig,
+            {
+                "decimation": controller.decimation,
+                "commands": to_dict(controller.bounds),
+                "cues": "both" if len(given) == 2 else (given or ["none"])[0],
+            },
+        )
         self.bounds = controller.bounds
         self.action: NDArray[np.floating] | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal, self._family = loco, goal[0], family
-        self._controller.reset(float(loco.clock.clock[0]))
+        self.controller.reset(float(loco.clock.clock[0]))
 
     def readings(self) -> dict[str, Array]:
         """What the robot's sensors and map say now."""
         world = self._loco.world
-        return self._controller.sense(world.state, self._goal, self._family, world.ground_height)
+        return self.controller.sense(world.state, self._goal, self._family, world.ground_height)
 
     def command(self, step: int) -> Array:
         readings = self.readings()
-        self._targets = self._controller.step(readings)
-        if self._log is not None:
-            self._log.add(readings)
-        self.action = self._controller.high.values["decision"][None]
-        return self._controller.commands[None]
+        self._targets = self.controller.step(readings)
+        if self.log is not None:
+            self.log.add(readings)
+        self.action = self.controller.high.values["decision"][None]
+        return self.controller.commands[None]
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
         """Carry out the joint targets of the step that ``command`` ran."""
@@ -90,7 +99,7 @@ class Deployed:
         loco.command[:] = commands
         loco.targets = np.concatenate([self._targets[None, None], loco.targets[:-1]])
         loco.world.step(loco.targets, loco.delay, loco.joint_offset)
-        loco.clock.clock[:] = self._controller.low.values["next_clock"]
+        loco.clock.clock[:] = self.controller.low.values["next_clock"]
         loco.clock.update(commands[:, 12:], commands[:, INDEX["duration"]])
 
 
@@ -102,22 +111,20 @@ def load(export: Path) -> Controller:
 
 def run_episode(
     cell: Cell,
-    controller: Controller,
+    pair: Deployed,
     config: MujocoConfig,
     seed: int,
-    watchers: Sequence[Watcher] = (),
-    log: LogWriter | None = None,
+    watcher: Watcher,
     visual: bool = False,
 ) -> Episode:
     """Run the only episode of ``cell``.
 
     Args:
         cell: which one.
-        controller: what drives the robot.
+        pair: what drives the robot.
         config: MuJoCo's settings.
         seed: of the evaluation's tiles.
-        watchers: who look on.
-        log: that the controller's steps are written to.
+        watcher: who looks on.
         visual: keep what only a window shows.
 
     Raises:
@@ -125,18 +132,18 @@ def run_episode(
     """
     from tdgc.sim.mujoco_world import MujocoWorld
 
-    control = controller.low.table["joint_control"]
-    robot, physics = controller.robot(), config.physics(controller.dt, control["rate"]["value"])
+    controller, rate = pair.controller, pair.controller.low.table["joint_control"]["rate"]
+    robot, physics = controller.robot(), config.physics(controller.dt, rate["value"])
     low = LowLevelConfig(robot=robot, physics=physics)
     batch = Batch(
         cell, low, seed, make_world=lambda f: MujocoWorld(robot, physics, f, config, visual)
     )
-    pair, episode, watcher = Deployed(controller, log), EpisodeLog(batch), Together(watchers)
+    episode = EpisodeLog(batch)
     pair.begin(batch.loco, batch.goal, batch.told)
     watcher.begin(cell, batch.loco, batch.field, batch.goal)
     closed_loop(pair, pair, batch, episode, watcher)
-    if log is not None:
-        log.end(pair.readings())
+    if pair.log is not None:
+        pair.log.end(pair.readings())
     return episode.episodes()[0]
 
 
@@ -148,13 +155,13 @@ def run_cell(
     controller, episodes, recordings = load(export), [], list[Recording]()
     for number in range(cell.first, cell.first + cell.count):
         one = Cell(cell.policy, cell.condition, cell.family, cell.level, number, 1)
-        recorder = Recorder(Deployed(controller), seed, filmed)
-        log = LogWriter(controller) if number < logged else None
-        episode = run_episode(one, controller, config, seed, [recorder], log)
+        pair = Deployed(controller, LogWriter(controller) if number < logged else None)
+        recorder = Recorder(pair, seed, filmed)
+        episode = run_episode(one, pair, config, seed, recorder)
         episodes.append(episode)
         recordings += recorder.recordings()
-        if log is not None:
-            log.save(logs / f"{episode.name}.npz")
+        if pair.log is not None:
+            pair.log.save(logs / f"{episode.name}.npz")
     return episodes, recordings
 
 
@@ -200,7 +207,8 @@ def show(args: argparse.Namespace, config: MujocoConfig) -> None:
 
     cell = Cell(POLICY, "nominal", args.families[0], args.levels[0], 0, 1)
     with Window() as window:
-        episode = run_episode(cell, load(args.export), config, args.seed, [window], visual=True)
+        pair = Deployed(load(args.export))
+        episode = run_episode(cell, pair, config, args.seed, window, visual=True)
     print(f"{episode.outcome.replace('_', ' ')}, {episode.time_s:.1f} s")
 
 

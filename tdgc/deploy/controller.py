@@ -283,7 +283,8 @@ class Controller:
         family: str,
         ground: Callable[[Array, Array], Array],
     ) -> dict[str, Array]:
-        """What the sensors and the map of a simulated robot say: inputs of the graphs by name.
+        """What the sensors and the map of a simulated robot say: inputs of the graphs by name, and
+        its heading ``yaw``, which logs may have.
 
         Args:
             state: of one robot.
@@ -304,6 +305,7 @@ class Controller:
             "joint_angles": state.q[0],
             "joint_speeds": state.qd[0],
             "gyro": rotation.T @ state.ang_vel[0],
+            "yaw": state.yaw.copy(),
             "goal": heading @ (goal - position[:2]),
             "family": np.eye(len(families))[families.index(told)],
             "probes": ground(points[:, 0], points[:, 1]) - plane,

@@ -35,8 +35,9 @@ from tdgc.sim.terrain import file_label
 SENSED = ("gravity", "joint_angles", "joint_speeds", "goal")  # in every row
 GIVEN = ("clock", "commands", "joint_targets")  # in every row but the last
 DECIDED = ("family", "probes", "decision")  # where ``high`` decided, and empty (NaN) in other rows
-#: May be left out where no graph takes it; without it velocity and yaw rate are not known.
-GYRO = "gyro"
+#: What a log may lack if no graph takes it: angular velocity, and the heading in rad on the map
+#: that has the goal. Without both, velocity and yaw rate are not known; the gyro alone drifts.
+OPTIONAL = {"gyro": 3, "yaw": 1}
 ENDS = ("reached", "fell", "collided", "timeout")  # of an episode on no tile
 _SAME = 1e-3  # rad: targets written with four digits are not off by as much
 
@@ -66,8 +67,8 @@ def layout(controller: Controller) -> dict[str, int]:
     """Name and size of each value beside ``time``."""
     tables = controller.low.table, controller.high.table
     sizes = {s["name"]: s["shape"][0] for t in tables for s in (*t["inputs"], *t["outputs"])}
-    sizes.setdefault(GYRO, 3)
-    return {name: sizes[name] for name in (*SENSED, GYRO, *GIVEN, *DECIDED) if name in sizes}
+    sizes |= OPTIONAL
+    return {name: sizes[name] for name in (*SENSED, *OPTIONAL, *GIVEN, *DECIDED) if name in sizes}
 
 
 class LogWriter:
@@ -119,9 +120,9 @@ def read(path: Path, controller: Controller) -> Log:
         table = _read_csv(path) if path.suffix == ".csv" else dict(np.load(path))
     except (OSError, ValueError, EOFError, StopIteration) as error:
         raise LogError(f"{path}: missing, or neither an .npz nor a .csv of numbers") from error
-    sizes = layout(controller)
-    if GYRO not in table and all(s["name"] != GYRO for s in controller.low.table["inputs"]):
-        del sizes[GYRO]
+    taken = [signal["name"] for signal in controller.low.table["inputs"]]
+    left_out = [name for name in OPTIONAL if name not in table and name not in taken]
+    sizes = {name: size for name, size in layout(controller).items() if name not in left_out}
     rows = table["time"].size if "time" in table else 0
     shapes: dict[str, tuple[int, ...]] = {"time": (rows,)}
     shapes |= {name: (rows, size) for name, size in sizes.items()}
@@ -168,7 +169,7 @@ def _gap(log: Log, controller: Controller) -> str | None:
         return f"a gap at {time[k]:.2f} s: {wrong} that are due every {every * dt:g} s"
     steps = np.arange(len(time))
     for names, rows in (
-        ((*SENSED, GYRO), steps),
+        ((*SENSED, *OPTIONAL), steps),
         (GIVEN, steps[:-1]),
         (DECIDED, log.decisions),
     ):
@@ -224,8 +225,8 @@ def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
 def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
     """The trace of a log, without what only a simulator knows.
 
-    Velocity is how the goal moved as seen from the robot, whose turning the gyro measured. What
-    follows the last decision by more than its interval, standing at the goal, is no part of it.
+    Velocity is how the goal moved as seen from the robot, whose heading is known. What follows the
+    last decision by more than its interval, standing at the goal, is no part of the trace.
 
     Args:
         log: of one episode.
@@ -269,17 +270,20 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
         fill(slice(-1), {"family": told_families})
     if "probes" in seen:
         fill(slice(-1), probe_columns(seen["probes"][begin]))
-    measured = {"pitch": pitch, "roll": roll}
-    if GYRO in seen:
-        measured["yaw_rate"] = -np.sum(seen["gravity"] * seen[GYRO], axis=1)
     seconds = log.time[end] - log.time[begin]
     errors = {
         f"error_{name}": [values[a + 1 : b + 1].mean() for a, b in zip(begin, end, strict=True)]
         - command[:, INDEX[name]]
-        for name, values in measured.items()
+        for name, values in (("pitch", pitch), ("roll", roll))
     }
-    if GYRO in seen:
-        errors |= _velocity_errors(log, begin, end, measured["yaw_rate"])
+    yaw = _heading(log)
+    if yaw is not None:
+        turned = yaw[end] - yaw[begin]
+        goal = seen["goal"][:, 0] + 1j * seen["goal"][:, 1]  # ahead + i left
+        # How the goal moved, in the heading of the middle.
+        way = goal[begin] * np.exp(-0.5j * turned) - goal[end] * np.exp(0.5j * turned)
+        for name, change in (("vx", way.real), ("vy", way.imag), ("yaw_rate", turned)):
+            errors[f"error_{name}"] = change / seconds - command[:, INDEX[name]]
     fill(slice(1, None), {"seconds": seconds} | errors)
     return Trace(
         "tdgc",
@@ -293,19 +297,13 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
     )
 
 
-def _velocity_errors(
-    log: Log, begin: NDArray[np.intp], end: NDArray[np.intp], yaw_rate: Array
-) -> dict[str, Array]:
-    """Mean velocity ahead and to the left between the rows ``begin`` and ``end`` (k,), less that
-    commanded, in m/s: how the goal moved, seen in the heading of the middle."""
-    steps = 0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * np.diff(log.time)
-    yaw = np.concatenate([[0.0], np.cumsum(steps)])
-    half = 0.5 * (yaw[end] - yaw[begin])
-    goal = log.values["goal"][:, 0] + 1j * log.values["goal"][:, 1]  # ahead + i left
-    way = goal[begin] * np.exp(-1j * half) - goal[end] * np.exp(1j * half)
-    velocity = way / (log.time[end] - log.time[begin])
-    command = log.values["commands"][begin]
-    return {
-        "error_vx": velocity.real - command[:, INDEX["vx"]],
-        "error_vy": velocity.imag - command[:, INDEX["vy"]],
-    }
+def _heading(log: Log) -> Array | None:
+    """Heading at each row, (n,) rad from anywhere on: measured, or else what the gyro adds up to;
+    None without either."""
+    if "yaw" in log.values:
+        return np.unwrap(log.values["yaw"][:, 0])
+    if "gyro" not in log.values:
+        return None
+    rate = -np.sum(log.values["gravity"] * log.values["gyro"], axis=1)
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(log.time)
+    return np.concatenate([[0.0], np.cumsum(steps)])

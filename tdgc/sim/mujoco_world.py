@@ -148,7 +148,7 @@ class MujocoWorld(World):
         model.body(1).mass, model.body(1).inertia = share * mass, share * inertia
         model.geom_friction[:, 0] = friction[0]  # of two in contact MuJoCo takes the larger
         model.dof_armature[self._qd] = self._armature + armature
-        mujoco.mj_setConst(model, self.data)
+        mujoco.mj_setConst(model, mujoco.MjData(model))  # it leaves the robot elsewhere
 
     def retire(self, index: ArrayLike) -> None:
         """The robot's episode has ended, and this world has no other robot."""
