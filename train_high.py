@@ -26,10 +26,11 @@ from tdgc.learn.training import Interruption, Phase, add_arguments, configure, r
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import Policy
+from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.high_env import NavigationTask, load_low, paired, summarise
+from tdgc.tasks.high_env import NavigationTask, high_mirror, load_low, paired, summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.teacher import check_styles
 from tdgc.tasks.tiles import check_families
@@ -45,7 +46,9 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
     command[INDEX["vx"]] = config.start_speed
     decoder = CommandDecoder(config.env.commands, config.env.action_limit)
     with th.no_grad():
-        policy.action_net.get_parameter("bias").copy_(th.from_numpy(decoder.encode(command)))
+        head = policy.action_net
+        bias = (head.linear if isinstance(head, MirroredHead) else head).get_parameter("bias")
+        bias.copy_(th.from_numpy(decoder.encode(command)))
         policy.log_std[-1] = math.log(config.ppo.initial_gait_std)
 
 
@@ -104,6 +107,7 @@ def build(
             "lstm_hidden_size": ppo.lstm,
             "net_arch": {"pi": list(ppo.actor), "vf": list(ppo.critic)},
             "log_std_init": math.log(ppo.initial_std),
+            "mirror": high_mirror(config.env) if ppo.mirror else None,
         },
         seed=config.seed,
         device=device,

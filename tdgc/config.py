@@ -248,6 +248,8 @@ class HighLevelConfig:
 
     decimation: int = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
     cues: Literal["both", "semantic", "geometric", "none"] = "both"
+    # Where the heights of the geometric cue are probed, see ``tdgc.tasks.probes``.
+    probes: Literal["lines", "staggered"] = field(default="lines", metadata={"before": "staggered"})
     # Share of the robots in training that are told an unknown family, so that the probes alone have
     # to do: tiles of several families, or of none that has a name.
     unknown_share: float = 0.2
@@ -341,6 +343,7 @@ class RecurrentPPOConfig:
     initial_gait_std: float = 0.08
     # With 128 units each an update takes twice as long, and what is learned is no better.
     lstm: int = 64
+    mirror: bool = True  # policy and value exactly left-right symmetric
     actor: tuple[int, ...] = (64,)
     critic: tuple[int, ...] = (64,)
 
@@ -393,6 +396,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
         "ppo.n_epochs=5",
         "ppo.minibatches=4",
         "ppo.lstm=128",
+        "ppo.mirror=false",
         "ppo.actor=[128]",
         "ppo.critic=[128]",
         "env.unknown_share=0",

@@ -78,7 +78,7 @@ from tdgc.tasks.high_env import (
     high_layout,
     load_low,
 )
-from tdgc.tasks.probes import PROBE_RANGE, PROBES
+from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBES
 from tdgc.tasks.rules import GOAL_RADIUS, GOING, outcome
 
 #: Largest difference allowed between graphs and policies, in the units of the outputs: float32
@@ -337,7 +337,7 @@ class HighLevel(nn.Module):
         )
         cues = {
             "family": Signal("family", len(SEMANTIC), "1", family, "families"),
-            "probes": Signal("probes", len(PROBES), "m", probes, "probes"),
+            "probes": Signal("probes", NUM_PROBES, "m", probes, "probes"),
         }
         self.inputs = [
             Signal("goal", 2, "m", "ahead and to the left in the frame that turns by yaw alone"),
@@ -488,7 +488,7 @@ def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
         "decision": (*CONTINUOUS, "gait"),
         "families": SEMANTIC,
         "probes": {
-            "ahead_left": _quantity("m", PROBES.tolist()),
+            "ahead_left": _quantity("m", PROBES[task.probes].tolist()),
             "plane_below_trunk": _quantity("m", robot.base_height),
             "range": _quantity("m", PROBE_RANGE),
             "off_map": "nearest border",

@@ -33,7 +33,7 @@ from tdgc.benchmark.evaluation import (
 from tdgc.benchmark.flags import choose, choose_levels
 from tdgc.benchmark.recording import Recorder, Recording
 from tdgc.benchmark.results import describe, write_results
-from tdgc.config import HighLevelConfig, LowLevelConfig, from_dict, to_dict, with_overrides
+from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller, require
 from tdgc.deploy.log import LogWriter
 from tdgc.parallel.cores import usable_cores, workers_flag
@@ -62,22 +62,17 @@ class Deployed:
 
     def __init__(self, controller: Controller, log: LogWriter | None = None) -> None:
         self.controller, self.log = controller, log
-        names = [signal["name"] for signal in controller.high.table["inputs"]]
-        cues = {"family": "semantic", "probes": "geometric"}
-        given = [cue for name, cue in cues.items() if name in names]
-        self.config = from_dict(
-            HighLevelConfig,
-            {
-                "decimation": controller.decimation,
-                "commands": to_dict(controller.bounds),
-                "cues": "both" if len(given) == 2 else (given or ["none"])[0],
-            },
-        )
+        self.config = HighLevelConfig(decimation=controller.decimation, commands=controller.bounds)
         self.bounds = controller.bounds
         self.action: NDArray[np.floating] | None = None
+        self.told: str | None = None
+        self.probes: Array | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal, self._family = loco, goal[0], family
+        table = self.controller.high.table
+        if any(signal["name"] == "family" for signal in table["inputs"]):
+            self.told = table["families"][int(self.readings()["family"].argmax())]
         self.controller.reset(float(loco.clock.clock[0]))
 
     def readings(self) -> dict[str, Array]:
@@ -90,16 +85,21 @@ class Deployed:
         self._targets = self.controller.step(readings)
         if self.log is not None:
             self.log.add(readings)
-        self.action = self.controller.high.values["decision"][None]
+        decided = self.controller.high.values
+        self.action = decided["decision"][None]
+        if "probes" in decided:
+            self.probes = decided["probes"][None]
         return self.controller.commands[None]
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
         """Carry out the joint targets of the step that ``command`` ran."""
-        loco = self._loco
-        loco.command[:] = commands
+        loco, low = self._loco, self.controller.low.values
+        loco.command[:], loco.carried_out = commands, commands.copy()
+        went = np.mod(low["next_clock"] - low["clock"], 1.0)
+        loco.carried_out[:, INDEX["frequency"]] = went / self.controller.dt
         loco.targets = np.concatenate([self._targets[None, None], loco.targets[:-1]])
         loco.world.step(loco.targets, loco.delay, loco.joint_offset)
-        loco.clock.clock[:] = self.controller.low.values["next_clock"]
+        loco.clock.clock[:] = low["next_clock"]
         loco.clock.update(commands[:, 12:], commands[:, INDEX["duration"]])
 
 

@@ -44,7 +44,7 @@ from tdgc.tasks.high_env import (
     observe_high,
 )
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.probes import height_probes
+from tdgc.tasks.probes import PROBES, height_probes
 
 LOW = PRETRAINED / "low"
 CONFIG = HighLevelConfig(
@@ -201,7 +201,7 @@ def test_mixed_terrain_is_unknown_to_the_high_level(low, tmp_path):
 
         def expected(index: int) -> Array:
             zero, families = np.zeros((1, NUM_ACTIONS)), np.array([index])
-            probes = height_probes(loco)
+            probes = height_probes(loco, PROBES["lines"])
             seen = observe_high(loco, goal, np.zeros(1), zero, families, config.cues, probes)
             return CommandDecoder(config.commands).decode(high.predict(seen)[0])
 

@@ -216,7 +216,7 @@ def test_shares_are_of_the_gaits_commanded(low, high, monkeypatch):
     monkeypatch.setattr(evaluation, "HORIZON", 1.0)
     driver = Recorder(*load_high(high, low, low_config(low)))
     episodes = run_cell(Cell("tdgc", "nominal", "rough", 0, 0, 2), low, driver, seed=0)
-    assert np.count_nonzero(episodes[0].shares) > 2
+    assert np.count_nonzero(episodes[0].shares) > 1
     for k, episode in enumerate(episodes):
         said = np.array(driver.said)[: round(episode.time_s / 0.02), k, 12:]
         for embedding, share in zip(GAIT_TABLE, episode.shares, strict=True):

@@ -34,7 +34,7 @@ from tdgc.sim.locomotion import (
 )
 from tdgc.sim.robot import JOINTS, nominal_pose
 from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_layout, load_low, observe_high
-from tdgc.tasks.probes import height_probes
+from tdgc.tasks.probes import PROBES, height_probes
 
 LOW = PRETRAINED / "low"
 LOW_POLICY, LOW_CONFIG = load_low(LOW)
@@ -222,7 +222,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: s
         elapsed = np.arange(5) * 17
         seen = observe_high(
             loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
-            task.family_index, cues, height_probes(loco),
+            task.family_index, cues, height_probes(loco, PROBES["lines"]),
         )  # fmt: skip
         wanted, (hidden, cell) = policy.predict(seen, (memory[:1], memory[1:]))
         state = loco.world.state

@@ -11,8 +11,11 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import tdgc  # noqa: F401  registers the environments
-from tdgc.config import ConfigError, HighLevelConfig, HighRewardConfig
-from tdgc.sim.locomotion import Locomotion
+from tdgc.config import ConfigError, HighLevelConfig, HighRewardConfig, RobotConfig
+from tdgc.sim.commands import NAMES
+from tdgc.sim.locomotion import Locomotion, action_mirror
+from tdgc.sim.robot import nominal_pose
+from tdgc.sim.terrain import TILE_SIZE, make_tile
 from tdgc.tasks import rewards
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import (
@@ -20,6 +23,7 @@ from tdgc.tasks.high_env import (
     SEMANTIC,
     NavigationTask,
     high_layout,
+    high_mirror,
     load_low,
     paired,
 )
@@ -27,6 +31,8 @@ from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rewards import HighStep
 
 LOW = PRETRAINED / "low"
+POINTS = PROBES["lines"]
+NOMINAL = nominal_pose(RobotConfig())
 CONFIG = HighLevelConfig(commands=load_low(LOW)[1].commands)
 
 
@@ -129,7 +135,65 @@ def test_layout_and_cues():
     sizes = {cues: sum(n for _, n in high_layout(cues)) for cues in
              ("none", "semantic", "geometric", "both")}  # fmt: skip
     assert sizes == {"none": 48, "semantic": 54, "geometric": 80, "both": 86}
-    assert len(PROBES) == 32 and SEMANTIC[-1] == "unknown"
+    assert SEMANTIC[-1] == "unknown"
+
+
+@pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])
+def test_mirrored_robots_see_mirrored_things(cues):
+    """A robot and its mirror image on a pillar's tile and on that tile mirrored."""
+    config = dataclasses.replace(CONFIG, cues=cues, families=("pillar",), unknown_share=0.0)
+    task = NavigationTask(config, LOW, 2, seed=0, training=False)
+    loco, state, rng = task.locomotion, task.locomotion.world.state, np.random.default_rng(0)
+    tile = make_tile("pillar", 1.0, rng)
+    image = dataclasses.replace(tile, heights=tile.heights[:, ::-1], support=tile.support[:, ::-1])
+    for row, placed in enumerate((tile, image)):
+        task.field.place(row, 0, placed)
+    task.reset(np.arange(2))
+    origin, middle = task.field.origin(np.arange(2), 0), TILE_SIZE / 2
+    task.goal[:] = origin + [[7.25, middle + 0.6], [7.25, middle - 0.6]]
+    command = task.decoder.decode(rng.uniform(-1.0, 1.0, 13))
+    mirror = high_mirror(config)
+    sign = np.array([-1.0 if name in ("vy", "yaw_rate", "roll") else 1.0 for name in NAMES])
+    loco.command[:] = [command, sign * command]
+    x, y, _ = tile.features.pillars[0]
+    xy = origin + [[x - 0.7, y + 0.1], [x - 0.7, TILE_SIZE - y - 0.1]]
+    loco.place(np.arange(2), xy, np.array([0.3, -0.3]), np.full(2, 0.2))
+    angles = rng.normal(0.0, 0.2, 12)
+    index, flip = action_mirror()
+    state.q[:] = [NOMINAL + angles, NOMINAL + angles[index] * flip]
+    state.derive()
+    task._actions[0] = rng.uniform(-1.0, 1.0, 13)
+    task._actions[0, 1] *= mirror.action_sign
+    task._probes.begin(np.arange(2))
+    seen, other = task.observe()
+    np.testing.assert_allclose(
+        other, seen[list(mirror.obs_index)] * np.float32(mirror.obs_sign), atol=2e-5
+    )
+    assert np.abs(other - seen).max() > 0.3
+    task.close()
+
+
+def test_a_symmetric_policy_needs_the_same_bounds_to_both_sides():
+    ranges = dataclasses.replace(CONFIG.commands, vy=(-0.2, 0.6))
+    with pytest.raises(ConfigError, match=r"^commands.vy must be the same to both sides .* \[-0.2"):
+        high_mirror(dataclasses.replace(CONFIG, commands=ranges))
+    with pytest.raises(ConfigError, match=r"^probes that are staggered are not the same on both"):
+        high_mirror(dataclasses.replace(CONFIG, probes="staggered"))
+
+
+def test_the_teachers_episodes_move_no_levels():
+    config = dataclasses.replace(CONFIG, window=2, threshold=2, first_levels=3)
+    task = NavigationTask(config, LOW, 10, seed=0, guided=100)
+    task.reset(np.arange(10))
+    task.curriculum.push(np.arange(10), np.zeros(10, dtype=bool))
+    task._led[:] = np.arange(10) < 5
+    task.elapsed[:] = task.horizon - 1
+    before = task.curriculum.levels.copy()
+    assert (before[5:] > 0).any()
+    task.step(np.zeros((10, 13)))
+    after = task.curriculum.levels
+    assert (after[:5] == before[:5]).all() and (after[5:] == np.maximum(before[5:] - 1, 0)).all()
+    task.close()
 
 
 def test_some_robots_in_training_are_not_told_their_family():
@@ -160,8 +224,8 @@ def test_goal_is_seen_in_the_heading_frame(task):
 def test_probes_see_what_is_ahead(task):
     # Robot 1 looks at a wall that begins 0.4 m ahead of it.
     state = task.locomotion.world.state
-    row = np.flatnonzero(PROBES[:, 0] > 0.45)
-    near = np.flatnonzero(PROBES[:, 0] < 0.35)
+    row = np.flatnonzero(POINTS[:, 0] > 0.45)
+    near = np.flatnonzero(POINTS[:, 0] < 0.35)
     n = 161
     x = state.position[1, 0] + 0.4
     task.field.heights[n : 2 * n] = 0.0
@@ -186,7 +250,7 @@ def test_sensors_are_noisy_in_training_only(training):
         task.reset(np.arange(5))
         loco = task.locomotion
         seen = task.observe()[:, columns("both")["probes"]] * PROBE_RANGE
-        off = np.abs(seen - height_probes(loco))
+        off = np.abs(seen - height_probes(loco, POINTS))
         assert (off.max() > 0.01) == training and off.max() <= 0.02 + 1e-6
         exact.load_state_dict(loco.state_dict())
         task._executor.step(task.decoder.decode(np.zeros((5, 13))))

@@ -246,11 +246,21 @@ def test_a_log_has_what_the_simulator_knows_but_its_truth(
     exact = [
         c.name for c in trace.COLUMNS if c.name.startswith(("action_", "command_", "at_bound_"))
     ]
-    exact += ["time", "pitch", "roll", "goal_distance", "goal_bearing", "error_pitch", "error_roll"]
+    exact += [
+        "time",
+        "pitch",
+        "roll",
+        "goal_distance",
+        "goal_bearing",
+        "asked_frequency",
+        "error_pitch",
+        "error_roll",
+    ]
     exact += [f"probe_{k:02d}" for k in range(32)] + ["seconds"]
     for name in exact:
         assert seen[name][:-1] == pytest.approx(truth[name][:-1], abs=1e-4, nan_ok=True), name
-    assert list(seen["gait"][:-1]) == list(truth["gait"][:-1])
+    for name in ("gait", "family"):
+        assert list(seen[name][:-1]) == list(truth[name][:-1])
     # Means over all of it; within a decision a trunk sways, and the simulator samples that.
     for name, rounding in (("vx", 0.01), ("vy", 0.01), ("yaw_rate", 0.01)):
         off = seen[f"error_{name}"][1:-1] - truth[f"error_{name}"][1:-1]

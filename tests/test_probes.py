@@ -11,7 +11,14 @@ from tdgc.config import PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TileField, make_tile
-from tdgc.tasks.probes import PROBE_RANGE, PROBES, HeightProbes, height_probes
+from tdgc.tasks.probes import (
+    NUM_PROBES,
+    PROBE_RANGE,
+    PROBE_SWAP,
+    PROBES,
+    HeightProbes,
+    height_probes,
+)
 
 ROBOTS = 8
 
@@ -31,23 +38,35 @@ def loco() -> Iterator[Locomotion]:
     loco.world.close()
 
 
+POINTS = PROBES["lines"]
+
+
+def test_they_are_the_same_on_both_sides_and_close_enough() -> None:
+    assert len(POINTS) == NUM_PROBES == 32
+    np.testing.assert_allclose(POINTS[list(PROBE_SWAP)] * [1.0, -1.0], POINTS, atol=1e-12)
+    ahead = np.sort(POINTS[POINTS[:, 1] == 0.0, 0])
+    np.testing.assert_allclose(np.diff(ahead), 0.05)
+    assert ahead[0] == 0.1 and ahead[-1] == pytest.approx(1.05)
+    np.testing.assert_allclose(np.unique(POINTS[:, 1]), [-0.4, -0.2, 0.0, 0.2, 0.4])
+
+
 def begun(loco: Locomotion, noise: Noise | None) -> HeightProbes:
-    probes = HeightProbes(loco, noise)
+    probes = HeightProbes(loco, POINTS, noise)
     probes.begin(np.arange(ROBOTS))
     return probes
 
 
 def test_they_see_the_trench_ahead(loco: Locomotion) -> None:
     seen = begun(loco, None).read()
-    assert np.array_equal(seen, height_probes(loco))
-    before, in_it = PROBES[:, 0] < 0.55, (PROBES[:, 0] > 0.65) & (PROBES[:, 0] < 0.8)
+    assert np.array_equal(seen, height_probes(loco, POINTS))
+    before, in_it = POINTS[:, 0] < 0.55, (POINTS[:, 0] > 0.65) & (POINTS[:, 0] < 0.8)
     assert (np.abs(seen[:, before]) < 0.05).all()
     assert (seen[:, in_it] == -PROBE_RANGE).all()
 
 
 def test_noise_is_as_wide_as_it_says(loco: Locomotion) -> None:
     noise = Noise(RandomisationConfig(noise_probes=0.02, probe_delay=0.0), np.random.default_rng(0))
-    probes, exact = begun(loco, noise), height_probes(loco)
+    probes, exact = begun(loco, noise), height_probes(loco, POINTS)
     level = np.abs(exact) < 0.1
     off = []
     for _ in range(20):
@@ -64,12 +83,12 @@ def test_the_late_are_one_decision_late(loco: Locomotion) -> None:
     probes = begun(loco, Noise(config, np.random.default_rng(1)))
     late = probes.late.copy()
     assert 0 < late.sum() < ROBOTS
-    seen = [height_probes(loco)]
+    seen = [height_probes(loco, POINTS)]
     assert np.array_equal(probes.read(), seen[0])  # nothing was seen before
     for _ in range(3):
         loco.world.state.position[:, 0] += 0.07
         probes.measure()
-        seen.append(height_probes(loco))
+        seen.append(height_probes(loco, POINTS))
         assert np.array_equal(probes.read()[late], seen[-2][late])
         assert np.array_equal(probes.read()[~late], seen[-1][~late])
         assert (np.abs(seen[-1] - seen[-2]).max(axis=1) > 0.1).all()  # a probe came to a lip
@@ -84,4 +103,4 @@ def test_share_of_the_late(loco: Locomotion, delay: float, scale: float, late: i
     probes = begun(loco, Noise(config, np.random.default_rng(1)))
     assert probes.late.sum() == late
     if not scale:
-        assert np.array_equal(probes.read(), height_probes(loco))
+        assert np.array_equal(probes.read(), height_probes(loco, POINTS))

@@ -27,7 +27,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
 from tdgc.tasks.high_env import PRETRAINED, load_low
-from tdgc.tasks.probes import height_probes
+from tdgc.tasks.probes import PROBES, height_probes
 
 ROOT = Path(__file__).resolve().parents[1]
 HOLD = 5  # control steps a decision
@@ -39,7 +39,7 @@ class Notes(Tracer):
     def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
         super().begin(cell, loco, field, goal)
         self.goal, self.seen = goal, [self._note(loco)]
-        self.probes = height_probes(loco)
+        self.probes = height_probes(loco, PROBES["lines"])
 
     def step(self, step: int, live: Any, outcome: Any) -> None:
         super().step(step, live, outcome)
@@ -56,9 +56,11 @@ class Notes(Tracer):
             "turn": s.ang_vel[:, 2].copy(),
             "touch": s.foot_force > 1.0,
             "wanted": loco.clock.contact > 0.5,
+            "probes": height_probes(loco, PROBES["lines"]),
             "power": np.abs(s.torque * s.qd).sum(axis=1),
             "force": np.column_stack([s.trunk_force, s.leg_force]),
             "command": loco.command.copy(),
+            "carried out": loco.carried_out.copy(),
         }
 
     def over(self, decision: int, name: str, k: int) -> Array:
@@ -81,10 +83,14 @@ def low():
 
 
 @pytest.fixture(scope="module")
-def watched(low, tmp_path_factory: pytest.TempPathFactory):
+def watched_high(low, tmp_path_factory: pytest.TempPathFactory):
+    return load_high(save_high(tmp_path_factory.mktemp("policy") / "high", low), *low)
+
+
+@pytest.fixture(scope="module")
+def watched(low, watched_high):
     """The notes, traces and episodes of a high level that is quick to change its mind."""
-    path = save_high(tmp_path_factory.mktemp("policy") / "high", low)
-    driver = HierarchyDriver(*load_high(path, *low))
+    driver = HierarchyDriver(*watched_high)
     return watch(driver, Cell("tdgc", "nominal", "rough", 8, 3, 2), low[0])
 
 
@@ -114,9 +120,15 @@ def test_decisions_are_those_of_the_policy_and_what_they_decode_to(watched):
     for k, t in enumerate(traces):
         actions = np.stack([t[f"action_{name}"] for name in (*CONTINUOUS, "gait")], axis=1)
         commands = np.stack([t[f"command_{name}"] for name in NAMES], axis=1)
-        assert commands[:-1] == pytest.approx(decoder.decode(actions[:-1]), abs=1e-6)
+        asked = commands.copy()
+        asked[:, INDEX["frequency"]] = t["asked_frequency"]
+        assert asked[:-1] == pytest.approx(decoder.decode(actions[:-1]), abs=1e-6)
         given = [notes.seen[HOLD * decision + 1]["command"][k] for decision in range(11)]
-        assert commands[:-1] == pytest.approx(np.array(given), abs=1e-6)
+        assert asked[:-1] == pytest.approx(np.array(given), abs=1e-6)
+        done = [notes.seen[HOLD * decision + 1]["carried out"][k] for decision in range(11)]
+        assert commands[:-1] == pytest.approx(np.array(done), abs=1e-6)
+        # Gaits change all the time here, and none begins below 3.5 Hz.
+        assert (t["command_frequency"] - t["asked_frequency"])[:-1].max() > 0.1
         assert t["gait"][:-1].tolist() == [GAITS[g] for g in decoder.gait(actions[:-1])]
         assert np.isnan(actions[-1]).all() and np.isnan(commands[-1]).all()
         assert t["gait"][-1] is None
@@ -142,6 +154,20 @@ def test_cues_are_what_the_high_level_was_told(watched):
     for k, t in enumerate(traces):
         assert set(t["family"]) == {"rough"}
         assert [t[f"probe_{i:02d}"][0] for i in range(32)] == pytest.approx(notes.probes[k])
+        assert np.isnan(t["probe_00"][-1])  # the end has no decision
+
+
+def test_cues_are_those_of_the_condition(low, watched_high):
+    """With noise, probes are off by up to 2 cm and a decision late."""
+    driver = HierarchyDriver(*watched_high)
+    notes, traces, _ = watch(driver, Cell("tdgc", "noise", "stair", 8, 3, 2), low[0])
+    for k, t in enumerate(traces):
+        told = np.array([[t[f"probe_{i:02d}"][d] for i in range(32)] for d in range(3)])
+        for decision, seen in enumerate((0, 0, 1)):
+            off = np.abs(told[decision] - notes.seen[HOLD * seen]["probes"][k])
+            assert 0.01 < off.max() <= 0.02 + 1e-6
+    _, (t, _), _ = watch(driver, Cell("tdgc", "no-family", "stair", 8, 3, 2), low[0])
+    assert set(t["family"]) == {"unknown"}
 
 
 def test_execution_is_measured_since_the_decision_before(watched):
@@ -201,6 +227,7 @@ def test_reward_terms_are_those_of_the_paper(watched):
         expected = c.action_rate * dt * np.sum(np.diff(clipped, axis=0) ** 2, axis=1)
         assert t["reward_action_rate"][1:] == pytest.approx(expected, rel=1e-4)
         commands = np.stack([t[f"command_{name}"] for name in NAMES], axis=1)[:-1]
+        commands[:, INDEX["frequency"]] = t["asked_frequency"][:-1]
         shares = np.hstack([(commands[:, :12] - low) / (high - low), 2.0 * commands[:, 12:]])
         expected = c.command_rate * dt * np.mean(np.diff(shares, axis=0) ** 2, axis=1)
         assert t["reward_command_rate"][2:] == pytest.approx(expected, rel=1e-4)
@@ -268,7 +295,7 @@ def test_a_file_holds_the_trace_and_says_what_it_is(watched, tmp_path):
         assert (about["unit"], about["description"]) == (c.unit, c.meaning)
         assert schema.field(c.name).type in (pa.float32(), pa.string())  # scalars only
     meta = {k.decode(): v.decode() for k, v in schema.metadata.items()}
-    assert meta["format"] == "tdgc-trace" and meta["version"] == "1"
+    assert meta["format"] == "tdgc-trace" and meta["version"] == "2"
     assert (meta["outcome"], meta["seed"], meta["episode"]) == (t.outcome, "5", "3")
     assert pq.read_table(path)["command_vx"].null_count == 1  # the end has no decision
 
@@ -287,8 +314,8 @@ def test_files_that_are_no_traces_are_refused(watched, tmp_path):
     path = trace.write(watched[1][0], tmp_path)
     table = pq.read_table(path)
     meta = table.schema.metadata
-    pq.write_table(table.replace_schema_metadata(meta | {b"version": b"2"}), other)
-    with pytest.raises(TraceError, match=r"a trace of version 2, this package reads 1$"):
+    pq.write_table(table.replace_schema_metadata(meta | {b"version": b"1"}), other)
+    with pytest.raises(TraceError, match=r"a trace of version 1, this package reads 2$"):
         trace.read(other)
     moved = table.schema.field("probe_00").with_metadata({"unit": "m", "description": "elsewhere"})
     place = table.schema.get_field_index("probe_00")
@@ -298,7 +325,7 @@ def test_files_that_are_no_traces_are_refused(watched, tmp_path):
         table.cast(table.schema.set(place, moved)),
     ):
         pq.write_table(wrong, other)
-        with pytest.raises(TraceError, match=r"columns are not those of a trace of version 1$"):
+        with pytest.raises(TraceError, match=r"columns are not those of a trace of version 2$"):
             trace.read(other)
     lacking = {k: v for k, v in meta.items() if k != b"seed"}
     pq.write_table(table.replace_schema_metadata(lacking), other)
@@ -374,7 +401,7 @@ def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
     assert [(d["episode"], d["outcome"]) for d in diagnosed] == [
         (r["episode"], r["outcome"]) for r in failed
     ]
-    assert "most is to be won in gap, by execution: 100.0 points" in capsys.readouterr().out
+    assert "most is to be won in gap, by decisions: 100.0 points" in capsys.readouterr().out
     # Fewer traces in the same folder: none of the old ones is left.
     assert evaluate.main([*flags, "--trace", "1"]) == 0
     assert [p.name for p in (tmp_path / "traces").iterdir()] == ["gp_nominal_gap_10_000.parquet"]

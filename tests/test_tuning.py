@@ -132,6 +132,18 @@ def test_tilted_robots_are_slowed_at_every_control_step(pair, loco):
         state.derive()
 
 
+def test_a_gait_begins_no_faster_than_its_bound(pair, loco):
+    """The robot's start frequency of 3.5 Hz gives way to a lower bound."""
+    assert loco.robot.start_frequency == 3.5
+    for assignment, most in (("decoder.frequency.high=2.5", 2.5), ("decoder.vx.high=0.4", 3.5)):
+        driver = tuned(pair, assignment)
+        driver.begin(loco, np.array([[6.0, 0.0]]), "rough")
+        loco.clock.reset(np.arange(1), np.zeros(1))
+        loco.command[:] = driver.command(0)
+        loco.command[:, INDEX["frequency"]] = 2.2
+        assert loco.executed()[0, INDEX["frequency"]] == pytest.approx(most)
+
+
 def test_the_policy_sees_its_own_decisions(pair, loco):
     """A limit changes the robot's commands and not what the policy takes for its last action."""
     free, limited = HierarchyDriver(*pair), tuned(pair, "decoder.vx.high=-0.9")

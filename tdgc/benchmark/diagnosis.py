@@ -2,7 +2,8 @@
 
 - ``terrain``: the tile is of a kind that nothing was trained on.
 - ``execution``: the low level lost track of its commands, or the robot fell under a sane one.
-- ``decisions``: the commands were carried out, and they led to the failure.
+- ``decisions``: the commands were carried out, and they led to the failure; or the robot walked
+  into a trench that nothing had looked for.
 
 Tracking is lost where its errors are larger than in all but a few stretches of episodes that
 reached their goals: ``LIMITS``.
@@ -20,14 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tdgc.benchmark.evaluation import Episode, EpisodeRecord, tile_of
 from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
+from tdgc.sim.robot import Array
 from tdgc.sim.terrain import (
     GOAL_BEGIN,
     MAX_LEVEL,
-    PILLAR_HEIGHT,
     START_END,
     TILE_SIZE,
     ZONE,
@@ -146,7 +147,13 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
 
 def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[str, str, str]:
     """Layer, cause and evidence."""
-    intervals, held = judged(trace), near_pillar(trace, tile, hips + REACH)
+    intervals, x, y = judged(trace), trace["base_x"], trace["base_y"]
+    # Near a pillar a robot may be held up by it.
+    held, at_trench = np.zeros(len(x), dtype=bool), False
+    if tile is not None:
+        held = to_pillars(tile, x, y).min(axis=1, initial=np.inf) < hips + REACH
+        away = to_trenches(tile, x[-1]).min(initial=np.inf)
+        at_trench = bool(away < hips + REACH) and trace.outcome != "left_tile"
     # Against a pillar or over the edge nothing is tracked, and that is no fault of who tracks.
     errors = tracking_errors(trace, intervals & ~(held | near_edge(trace, hips))[1:])
     limits = {
@@ -163,6 +170,8 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[str, str, str]
         return "terrain", "never trained on", evidence
     if towards < -AWAY:
         return "decisions", "led away from the goal", evidence
+    if at_trench and not has_looked(trace):
+        return "decisions", "walked blindly into a trench", evidence
     if lost:
         return "execution", f"lost track of {' and '.join(lost)}", evidence
     if down and towards > 0.0:
@@ -224,12 +233,10 @@ def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
     return float(np.average(towards[intervals], weights=trace["seconds"][1:][intervals]))
 
 
-def near_pillar(trace: Trace, tile: Tile | None, reach: float) -> NDArray[np.bool_]:
-    """Where the trunk was within ``reach`` m of a pillar, (n,): it may be held up by it."""
-    if tile is None:
-        return np.zeros(len(trace["time"]), dtype=bool)
-    x, y = trace["base_x"], trace["base_y"]
-    return np.array([_to_pillar(tile, *at)[0] < reach for at in zip(x, y, strict=True)])
+def has_looked(trace: Trace) -> bool:
+    """Whether the decisions looked at any cue of the terrain."""
+    told = any(family is not None for family in trace["family"])
+    return told or bool(np.isfinite(trace["probe_00"]).any())
 
 
 def near_edge(trace: Trace, hips: float) -> NDArray[np.bool_]:
@@ -282,27 +289,29 @@ def features(tile: Tile, x: float, y: float) -> Iterator[tuple[str, float]]:
     from (x, y) m in the tile's frame; numbered along the way."""
     found = tile.features
     if len(found.trenches):
-        away = np.maximum(np.maximum(found.trenches[:, 0] - x, x - found.trenches[:, 1]), 0.0)
+        away = to_trenches(tile, x)
         yield f"trench {away.argmin() + 1} of {away.size}", float(away.min())
     if len(found.risers):
         away = np.abs(x - found.risers[:, 0])
         yield f"step {away.argmin() + 1} of {away.size}", float(away.min())
     if len(found.pillars):
-        px, py, diameter = found.pillars.T
-        distance = np.maximum(np.hypot(px - x, py - y) - 0.5 * diameter, 0.0)
-        k = distance.argmin()
-        yield f"pillar at ({px[k]:.1f}, {py[k]:.1f}) m", float(distance[k])
+        away = to_pillars(tile, x, y)
+        px, py, _ = found.pillars[away.argmin()]
+        yield f"pillar at ({px:.1f}, {py:.1f}) m", float(away.min())
 
 
-def _to_pillar(tile: Tile, x: float, y: float) -> tuple[float, float, float]:
-    """Distance in m from (x, y) to the nearest sample of a pillar, and where that is; inf if there
-    is none. A pillar is what rises over the support surface."""
-    ix, iy = np.nonzero(tile.heights - tile.support > 0.5 * PILLAR_HEIGHT)
-    if not ix.size:
-        return np.inf, np.nan, np.nan
-    away = np.hypot(x - tile.cell * ix, y - tile.cell * iy)
-    k = int(away.argmin())
-    return float(away[k]), float(tile.cell * ix[k]), float(tile.cell * iy[k])
+def to_trenches(tile: Tile, x: ArrayLike) -> Array:
+    """Distances along the way, in m, from ``x`` (...) m to the k trenches, (..., k)."""
+    begin, end = tile.features.trenches.T
+    along = np.asarray(x)[..., None]
+    return np.asarray(np.maximum(np.maximum(begin - along, along - end), 0.0))
+
+
+def to_pillars(tile: Tile, x: ArrayLike, y: ArrayLike) -> Array:
+    """Distances in m from points (...) to the k pillars, (..., k)."""
+    px, py, diameter = tile.features.pillars.T
+    away = np.hypot(np.asarray(x)[..., None] - px, np.asarray(y)[..., None] - py)
+    return np.asarray(np.maximum(away - 0.5 * diameter, 0.0))
 
 
 # ---------------------------------------------------------------------------- results

@@ -25,7 +25,7 @@ from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.tasks.high_env import SEMANTIC, high_layout, observe_high, paired
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.probes import HeightProbes
+from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.teacher import Teacher, toward
 
 
@@ -36,11 +36,15 @@ class Driver(Protocol):
         config: the MDP of its decisions; cues "none" where it looks at none.
         bounds: what its commands stay within.
         action: (M, 13) of the last decision as the policy gave it; None where none is decoded.
+        told: the family that the semantic cue named; None where it is not looked at.
+        probes: (M, 32) m that the last decision looked at; None where it looked at none.
     """
 
     config: HighLevelConfig
     bounds: CommandRanges
     action: NDArray[np.floating] | None
+    told: str | None
+    probes: Array | None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         """New episodes for all robots of ``loco``.
@@ -86,6 +90,8 @@ class BaselineDriver:
         self.config = HighLevelConfig(cues="none")
         self.bounds = CommandRanges()
         self.action: NDArray[np.floating] | None = None
+        self.told: str | None = None
+        self.probes: Array | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
@@ -114,6 +120,8 @@ class TeacherDriver:
         self._landing = measure_landing(low, config)
         self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
+        self.told: str | None = None
+        self.probes: Array | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
@@ -142,6 +150,8 @@ class HierarchyDriver:
         assert config.commands is not None  # filled in by ``load_high``
         self.bounds = config.commands
         self.action: NDArray[np.floating] | None = None
+        self.told: str | None = None
+        self.probes: Array | None = None
         self._decoder = CommandDecoder(config.commands, config.action_limit)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
@@ -152,8 +162,10 @@ class HierarchyDriver:
         self._horizon = round(
             config.episode_seconds / (config.decimation * loco.physics.control_dt)
         )
-        self._probes = HeightProbes(loco, noise)
-        self._probes.begin(np.arange(m))
+        if config.cues in ("both", "semantic"):
+            self.told = SEMANTIC[seen]
+        self._sensor = HeightProbes(loco, PROBES[config.probes], noise)
+        self._sensor.begin(np.arange(m))
         self._state: policies.State | None = None
         self._last = np.zeros((m, NUM_ACTIONS))
 
@@ -161,7 +173,10 @@ class HierarchyDriver:
         decision, held = divmod(step, self.config.decimation)
         if held == 0:
             if decision > 0:
-                self._probes.measure()
+                self._sensor.measure()
+            looked = self._sensor.read()
+            if self.config.cues in ("both", "geometric"):
+                self.probes = looked
             observation = observe_high(
                 self._loco,
                 self._goal,
@@ -169,7 +184,7 @@ class HierarchyDriver:
                 self._last,
                 self._families,
                 self.config.cues,
-                self._probes.read(),
+                looked,
             )
             action, self._state = self._high.predict(observation, self._state)
             self.action, self._last = action, self._decoder.normalise(action)

@@ -39,13 +39,13 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import TileField
 from tdgc.tasks import rewards
-from tdgc.tasks.high_env import SEMANTIC, command_share, high_step
-from tdgc.tasks.probes import PROBES, height_probes
+from tdgc.tasks.high_env import command_share, high_step
+from tdgc.tasks.probes import NUM_PROBES, PROBES
 from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
 from tdgc.tasks.rules import OUTCOMES
 
 FORMAT = "tdgc-trace"
-VERSION = 1
+VERSION = 2
 
 
 class TraceError(InputError):
@@ -66,7 +66,7 @@ TRACKED = ("vx", "vy", "yaw_rate", "body_height", "pitch", "roll")
 _ACTIONS = tuple(f"action_{name}" for name in (*CONTINUOUS, "gait"))
 _COMMANDS = tuple(f"command_{name}" for name in NAMES)
 _AT_BOUND = tuple(f"at_bound_{name}" for name in CONTINUOUS)
-_PROBES = tuple(f"probe_{i:02d}" for i in range(len(PROBES)))
+_PROBES = tuple(f"probe_{i:02d}" for i in range(NUM_PROBES))
 _REWARDS = tuple(f"reward_{name}" for name in HIGH_TERMS)
 
 
@@ -82,13 +82,15 @@ def _columns() -> Iterator[Column]:
     yield Column("goal_distance", "m", "from the trunk to the goal")
     yield Column("goal_bearing", "rad", "of the goal against the heading, to the left positive")
     yield Column("family", "", "cue: the terrain family that the high level was told")
-    for name, (x, y) in zip(_PROBES, PROBES, strict=True):
+    for name, (x, y) in zip(_PROBES, PROBES["lines"], strict=True):
         where = f"({x:g}, {y:g}) m ahead and to the left"
         yield Column(name, "m", f"cue: ground {where}, against where a standing robot's would be")
     for name in _ACTIONS:
         yield Column(name, "1", "action of the policy, before it is decoded")
     for name, unit in zip(NAMES, UNITS, strict=True):
-        yield Column(f"command_{name}", unit, "command, as the low level got it")
+        yield Column(f"command_{name}", unit, "command, as it was carried out")
+    unit = UNITS[INDEX["frequency"]]
+    yield Column("asked_frequency", unit, "command, as it was asked for")
     yield Column("gait", "", "gait commanded")
     for name in CONTINUOUS:
         yield Column(f"at_bound_{name}", "1", "-1 or 1: at its lower or upper bound")
@@ -107,12 +109,12 @@ def _columns() -> Iterator[Column]:
         yield Column(name, "1", "term of the high level's reward, weighted")
 
 
-#: All columns in order. Numbers are float32. A value that there is none of is null: decisions in
-#: the last row, looks back in the first, actions and cues of a driver that has none, reward terms
-#: without a weight.
+#: All columns in order. Numbers are float32. A value that there is none of is null: decisions, and
+#: the probes that they look at, in the last row, looks back in the first, actions and cues of a
+#: driver that has none, reward terms without a weight.
 COLUMNS: tuple[Column, ...] = tuple(_columns())
 _TEXT = tuple(c.name for c in COLUMNS if not c.unit)
-_DECIDED = (*_ACTIONS, *_COMMANDS, "gait", *_AT_BOUND)
+_DECIDED = (*_PROBES, *_ACTIONS, *_COMMANDS, "asked_frequency", "gait", *_AT_BOUND)
 
 
 #: Seed and level of an episode that was on no tile: one of a real robot, say.
@@ -147,9 +149,13 @@ def action_columns(action: NDArray[np.floating]) -> dict[str, NDArray[Any]]:
     return dict(zip(_ACTIONS, action.T.copy(), strict=True))
 
 
-def command_columns(command: Array, bounds: CommandRanges) -> dict[str, NDArray[Any]]:
-    """Columns of commands (n, 15): themselves, their gait, and which are at their ``bounds``."""
-    columns: dict[str, NDArray[Any]] = dict(zip(_COMMANDS, command.T.copy(), strict=True))
+def command_columns(
+    command: Array, carried_out: Array, bounds: CommandRanges
+) -> dict[str, NDArray[Any]]:
+    """Columns of commands (n, 15) and of what was carried out of them (n, 15): the latter, the
+    gait, and which of the former are at their ``bounds``."""
+    columns: dict[str, NDArray[Any]] = dict(zip(_COMMANDS, carried_out.T.copy(), strict=True))
+    columns["asked_frequency"] = command[:, INDEX["frequency"]].copy()
     columns["gait"] = np.array(GAITS, dtype=object)[gait_index(command)]
     for j, name in enumerate(CONTINUOUS):
         low, high = getattr(bounds, name)
@@ -241,7 +247,9 @@ class Tracer:
         if driver.action is not None:
             row.update(action_columns(driver.action))
             self._actions = np.stack([self._decoder.normalise(driver.action), self._actions[0]])
-        row.update(command_columns(command, driver.bounds))
+        row.update(command_columns(command, self._loco.carried_out, driver.bounds))
+        if driver.probes is not None:
+            row.update(probe_columns(driver.probes))
         share = command_share(command, self._decoder)
         self._shares = np.concatenate([share[None], self._shares[:-1]])
         self._clear()
@@ -280,19 +288,11 @@ class Tracer:
         row["pitch"], row["roll"] = tilt(state.gravity)
         row["goal_distance"] = np.linalg.norm(offset, axis=1)
         row["goal_bearing"] = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
-        self._add_cues(row)
+        row["family"] = np.full(len(nothing), self._driver.told, object)
         if self._count.any():
             self._add_execution(row)
         self._rows.append(row)
         self._count[:] = 0.0
-
-    def _add_cues(self, row: dict[str, NDArray[Any]]) -> None:
-        cues, family = self._driver.config.cues, self._cell.family
-        if cues in ("both", "semantic"):
-            told = family if family in SEMANTIC else "unknown"
-            row["family"] = np.full(self._loco.num_robots, told, object)
-        if cues in ("both", "geometric"):
-            row.update(probe_columns(height_probes(self._loco)))
 
     def _add_execution(self, row: dict[str, NDArray[Any]]) -> None:
         count = np.where(self._count > 0.0, self._count, np.nan)  # some ended long ago

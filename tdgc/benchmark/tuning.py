@@ -38,7 +38,9 @@ from tdgc.config import (
 from tdgc.policies import Policy
 from tdgc.sim.commands import CONTINUOUS, INDEX
 from tdgc.sim.gaits import GAITS, gait_embedding
+from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
+from tdgc.sim.sensors import Noise
 
 _VELOCITIES = ("vx", "vy", "yaw_rate")
 
@@ -210,6 +212,10 @@ class TunedDriver(HierarchyDriver):
         self._bounds = np.array(dataclasses.astuple(self.bounds)).T
         self._gaits = np.array(sorted(GAITS.index(name) for name in tuning.decoder.gaits))
         self._safety = tuning.safety
+
+    def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
+        super().begin(loco, goal, family, noise)
+        loco.frequency_limit = self.bounds.frequency[1]
 
     def command(self, step: int) -> Array:
         command = super().command(step).copy()

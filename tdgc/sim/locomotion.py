@@ -101,6 +101,8 @@ class Locomotion:
         command: (M, 15), to be set by the caller.
         actions: (2, M, 12), the last clipped action and the one before.
         targets: (3, M, 12) rad, joint targets of the last step and the two before.
+        carried_out: (M, 15), what ``executed`` was in the last control step.
+        frequency_limit: Hz, that the start of a gait is not hurried beyond.
         delay: (M,) s of latency; joint_offset: (M, 12) rad; friction, payload: (M,); armature:
             (M,) kg m^2.
     """
@@ -123,6 +125,8 @@ class Locomotion:
         self.clock = PhaseClock(num_robots)
         self.nominal = nominal_pose(robot)
         self.command = np.tile(default_command(), (num_robots, 1))
+        self.carried_out = self.command.copy()
+        self.frequency_limit = np.inf
         self.actions = np.zeros((2, num_robots, NUM_JOINTS))
         self.targets = np.tile(self.nominal, (_HISTORY, num_robots, 1))
         self.delay = np.zeros(num_robots)
@@ -147,11 +151,12 @@ class Locomotion:
 
     def executed(self) -> Array:
         """The commands as they are carried out now, (M, 15): a gait begins no slower than
-        ``start_frequency``. At 2 Hz pronk and bound fly for a quarter of a second, and a robot's
-        first jump is too weak for that."""
+        ``start_frequency``, unless ``frequency_limit`` is lower. At 2 Hz pronk and bound fly for a
+        quarter of a second, and a robot's first jump is too weak for that."""
         begun, asked = self.clock.begun(self.robot.start_cycles), self.command[:, _FREQUENCY]
         command = self.command.copy()
-        command[:, _FREQUENCY] += (1.0 - begun) * np.maximum(self.robot.start_frequency - asked, 0)
+        least = min(self.robot.start_frequency, self.frequency_limit)
+        command[:, _FREQUENCY] += (1.0 - begun) * np.maximum(least - asked, 0)
         return command
 
     def pose(self) -> Array:
@@ -234,9 +239,10 @@ class Locomotion:
         targets = joint_targets(self.robot, geometry, self.pose(), clipped)
         self.targets = np.concatenate([targets[None], self.targets[:-1]])
         self.world.step(self.targets, self.delay, self.joint_offset)
+        self.carried_out = self.executed()
         self.clock.advance(
             self.physics.control_dt,
-            self.executed()[:, _FREQUENCY],
+            self.carried_out[:, _FREQUENCY],
             self.command[:, 12:],
             self.command[:, INDEX["duration"]],
         )

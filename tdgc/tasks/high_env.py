@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 
 from tdgc import policies
 from tdgc.config import (
+    CommandRanges,
     ConfigError,
     HighLevelConfig,
     HighRewardConfig,
     LowLevelConfig,
     recorded,
 )
-from tdgc.policies import Policy
-from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, gait_index
+from tdgc.policies import Mirror, Policy
+from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, CommandDecoder, gait_index
 from tdgc.sim.gaits import GAITS
-from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
+from tdgc.sim.locomotion import MIRRORS, SPEED_SCALE, Locomotion, mirror_map
 from tdgc.sim.robot import NUM_JOINTS, Array, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import FAMILIES, draw_start_goal
@@ -35,7 +36,13 @@ from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.low_env import TaskEnv
-from tdgc.tasks.probes import PROBE_RANGE, PROBES, HeightProbes
+from tdgc.tasks.probes import (
+    NUM_PROBES,
+    PROBE_RANGE,
+    PROBE_SWAP,
+    PROBES,
+    HeightProbes,
+)
 from tdgc.tasks.rules import REACHED, has_failed, outcome
 from tdgc.tasks.teacher import Teacher
 from tdgc.tasks.tiles import TrainingTiles
@@ -64,8 +71,45 @@ def high_layout(cues: str) -> tuple[tuple[str, int], ...]:
     if cues in ("both", "semantic"):
         layout.append(("family", len(SEMANTIC)))
     if cues in ("both", "geometric"):
-        layout.append(("probes", len(PROBES)))
+        layout.append(("probes", NUM_PROBES))
     return tuple(layout)
+
+
+_ACTION_SIGN = tuple(
+    -1.0 if name in ("vy", "yaw_rate", "roll") else 1.0 for name in (*CONTINUOUS, "gait")
+)
+#: How each part of ``high_layout`` looks in a left-right mirror: (source index, sign).
+_MIRRORS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
+    **MIRRORS,
+    "goal": ((0, 1, 2), (1.0, 1.0, -1.0)),
+    "time_left": ((0,), (1.0,)),
+    "last_action": (tuple(range(NUM_ACTIONS)), _ACTION_SIGN),
+    "family": (tuple(range(len(SEMANTIC))), (1.0,) * len(SEMANTIC)),
+    "probes": (PROBE_SWAP, (1.0,) * NUM_PROBES),
+}
+
+
+def high_mirror(config: HighLevelConfig) -> Mirror:
+    """Left-right mirror of the high policy's observations and actions.
+
+    Raises:
+        ConfigError: probes or bounds to one side that are not those to the other.
+    """
+    if config.probes != "lines":
+        raise ConfigError(
+            f"probes that are {config.probes} are not the same on both sides, as a symmetric "
+            "policy needs them; ppo.mirror=false does without symmetry"
+        )
+    for name in ("vy", "yaw_rate", "roll"):
+        low, high = getattr(config.commands or CommandRanges(), name)
+        if low != -high:
+            raise ConfigError(
+                f"commands.{name} must be the same to both sides for a symmetric policy, not "
+                f"{[low, high]}; ppo.mirror=false does without symmetry"
+            )
+    index, sign = mirror_map(high_layout(config.cues), _MIRRORS)
+    actions = tuple(range(NUM_ACTIONS))
+    return Mirror(tuple(index.tolist()), tuple(sign.tolist()), actions, _ACTION_SIGN)
 
 
 def observe_high(
@@ -259,7 +303,7 @@ class NavigationTask:
         noise = Noise(self.config.randomisation, self.rng) if self.training else None
         self.locomotion = Locomotion(m, c.robot, c.physics, self.field, c.gyro, self._visual)
         self._executor = Executor(self.locomotion, self.low, noise)
-        self._probes = HeightProbes(self.locomotion, noise)
+        self._probes = HeightProbes(self.locomotion, PROBES[self.config.probes], noise)
 
     # ------------------------------------------------------------------ episodes
 
@@ -349,8 +393,9 @@ class NavigationTask:
         done = np.flatnonzero(failed | truncated)
         self._count(terms, reward, commands, done, reached)
         if self.training:
-            if done.size:
-                self.curriculum.push(done, reached[done])
+            own = done[~self._led[done]]  # the teacher's episodes say nothing of the policy
+            if own.size:
+                self.curriculum.push(own, reached[own])
             self._push()
         return reward, failed, truncated
 

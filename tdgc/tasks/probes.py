@@ -11,18 +11,28 @@ from tdgc.sim.sensors import Noise
 
 PROBE_RANGE = 0.5  # m, deeper and higher looks the same
 
-#: 32 points (x ahead, y to the left) in m in the heading frame, from a hind foot to three strides
-#: ahead, staggered over four lines: an edge across the way is found to 5 cm, and a pillar on it,
-#: 20 cm wide at least, meets a probe.
-PROBES: Array = np.array([(0.05 * i - 0.25, (0.1, -0.3, 0.3, -0.1)[i % 4]) for i in range(32)])
+_AHEAD = [(0.1 + 0.05 * i, 0.0) for i in range(20)]
+_ASIDE = [(0.2 + 0.15 * i, side * (0.2, 0.4)[i % 2]) for i in range(6) for side in (1.0, -1.0)]
+#: Where the probes are: 32 points (x ahead, y to the left) in m in the heading frame. Those of
+#: ``lines`` are the same on both sides: an edge across the way is found to 5 cm a metre ahead, and
+#: no pillar, 20 cm wide at least, slips between lines 20 cm apart as they sweep over the ground.
+#: ``staggered`` is how the first policies looked ahead.
+PROBES: dict[str, Array] = {
+    "lines": np.array(_AHEAD + _ASIDE),
+    "staggered": np.array([(0.05 * i - 0.25, (0.1, -0.3, 0.3, -0.1)[i % 4]) for i in range(32)]),
+}
+NUM_PROBES = 32
+#: Which of ``lines`` is each one's mirror image.
+PROBE_SWAP = (*range(20), *(20 + i + (1, -1)[i % 2] for i in range(12)))
 
 
-def height_probes(loco: Locomotion) -> Array:
-    """Ground under ``PROBES`` against where a standing robot's ground would be, (M, 32) m."""
+def height_probes(loco: Locomotion, points: Array) -> Array:
+    """Ground under the robots' ``points`` (n, 2) m, one of ``PROBES``, against where a standing
+    robot's ground would be, (M, n) m."""
     state = loco.world.state
     c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
-    x = state.position[:, :1] + c * PROBES[:, 0] - s * PROBES[:, 1]
-    y = state.position[:, 1:2] + s * PROBES[:, 0] + c * PROBES[:, 1]
+    x = state.position[:, :1] + c * points[:, 0] - s * points[:, 1]
+    y = state.position[:, 1:2] + s * points[:, 0] + c * points[:, 1]
     standing = state.position[:, 2:3] - loco.robot.base_height
     return np.clip(loco.world.ground_height(x, y) - standing, -PROBE_RANGE, PROBE_RANGE)
 
@@ -35,6 +45,7 @@ class HeightProbes:
 
     Args:
         loco: the robots.
+        points: (32, 2) m, one of ``PROBES``.
         noise: of the sensor; None for an exact one.
 
     Attributes:
@@ -42,9 +53,9 @@ class HeightProbes:
         late: (M,) which robots read a decision late.
     """
 
-    def __init__(self, loco: Locomotion, noise: Noise | None) -> None:
-        self._loco, self._noise = loco, noise
-        self.measured = np.zeros((2, loco.num_robots, len(PROBES)))
+    def __init__(self, loco: Locomotion, points: Array, noise: Noise | None) -> None:
+        self._loco, self._points, self._noise = loco, points, noise
+        self.measured = np.zeros((2, loco.num_robots, NUM_PROBES))
         self.late = np.zeros(loco.num_robots, dtype=bool)
 
     def begin(self, index: NDArray[np.integer]) -> None:
@@ -65,7 +76,7 @@ class HeightProbes:
         return np.where(self.late[:, None], self.measured[1], self.measured[0])
 
     def _measure(self, index: NDArray[np.integer]) -> Array:
-        heights = height_probes(self._loco)[index]
+        heights = height_probes(self._loco, self._points)[index]
         if self._noise is not None:
             width = self._noise.config.noise_probes
             heights = heights + self._noise.draw(width, heights.shape)
