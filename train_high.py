@@ -20,9 +20,11 @@ import torch as th
 
 from tdgc import __version__
 from tdgc.config import PRESETS, ConfigError, HighTrainConfig, to_dict
+from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy
+from tdgc.learn.ppo import LinearRate, shared_keywords
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
-from tdgc.learn.training import Interruption, Phase, add_arguments, configure, run
+from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import Policy
@@ -52,26 +54,20 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
         policy.log_std[-1] = math.log(config.ppo.initial_gait_std)
 
 
-def build(
-    config: HighTrainConfig,
-    low: Policy,
-    device: str,
-    imitating: bool,
-    timeout: float,
-    link: MakeLink,
-) -> tuple[FastRecurrentPPO, TaskVecEnv]:
-    """Workers and learner of imitation, or of reinforcement learning."""
-    guided = config.imitation.steps // config.n_envs if imitating else 0
+def make_env(
+    config: HighTrainConfig, low: Policy, guided: int, timeout: float, link: MakeLink
+) -> TaskVecEnv:
+    """The workers; ``guided`` as ``NavigationTask`` has it."""
     env_config = config.env
     if config.imitation.steps:  # what was imitated on all levels goes on on all
         env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
     probe = NavigationTask(env_config, low, 1, seed=0, guided=guided)
     spaces = probe.observation_space, probe.action_space
+    probe.close()
     landing = None
     if guided and "gap" in env_config.families:
         landing = measure_landing(low, probe.low_config)
-    probe.close()
-    env = TaskVecEnv(
+    return TaskVecEnv(
         functools.partial(NavigationTask, env_config, low, guided=guided, landing=landing),
         config.n_envs,
         config.workers,
@@ -81,28 +77,27 @@ def build(
         timeout=timeout,
         link=link,
     )
+
+
+def make_learner(
+    learner: type[FastRecurrentPPO],
+    policy: type[FastRecurrentPolicy],
+    env: TaskVecEnv,
+    config: HighTrainConfig,
+    device: str,
+    **changed: Any,
+) -> FastRecurrentPPO:
+    """A recurrent learner that begins by walking straight on; ``changed`` are PPO's keywords."""
     ppo = config.ppo
-    first, last = ppo.learning_rate, ppo.final_learning_rate
-    learner, policy = (
-        (Apprentice, ApprenticePolicy) if imitating else (FastRecurrentPPO, FastRecurrentPolicy)
-    )
+    keywords = {
+        "learning_rate": LinearRate(ppo.learning_rate, ppo.final_learning_rate),
+        "batch_size": ppo.n_steps * config.n_envs // ppo.minibatches,
+        **shared_keywords(ppo),
+        **changed,
+    }
     model = learner(
         policy,
         env,
-        learning_rate=(
-            config.imitation.learning_rate
-            if imitating
-            else lambda remaining: last + remaining * (first - last)
-        ),
-        n_steps=ppo.n_steps,
-        batch_size=ppo.n_steps * config.n_envs // ppo.minibatches,
-        n_epochs=config.imitation.n_epochs if imitating else ppo.n_epochs,
-        gamma=ppo.gamma,
-        gae_lambda=ppo.gae_lambda,
-        clip_range=ppo.clip_range,
-        ent_coef=ppo.ent_coef,
-        vf_coef=ppo.vf_coef,
-        max_grad_norm=ppo.max_grad_norm,
         policy_kwargs={
             "lstm_hidden_size": ppo.lstm,
             "net_arch": {"pi": list(ppo.actor), "vf": list(ppo.critic)},
@@ -111,9 +106,45 @@ def build(
         },
         seed=config.seed,
         device=device,
+        **keywords,
     )
     start_walking(cast(FastRecurrentPolicy, model.policy), config)
+    return model
+
+
+def build_imitation(
+    config: HighTrainConfig, low: Policy, device: str, timeout: float, link: MakeLink
+) -> tuple[FastRecurrentPPO, TaskVecEnv]:
+    """Workers with a teacher, and the apprentice."""
+    imitation = config.imitation
+    env = make_env(config, low, imitation.steps // config.n_envs, timeout, link)
+    model = make_learner(
+        Apprentice, ApprenticePolicy, env, config, device,
+        learning_rate=imitation.learning_rate, n_epochs=imitation.n_epochs,
+    )  # fmt: skip
     return model, env
+
+
+def build_reinforcement(
+    config: HighTrainConfig, low: Policy, device: str, timeout: float, link: MakeLink
+) -> tuple[FastRecurrentPPO, TaskVecEnv]:
+    """Workers and learner of reinforcement learning."""
+    env = make_env(config, low, 0, timeout, link)
+    return make_learner(FastRecurrentPPO, FastRecurrentPolicy, env, config, device), env
+
+
+def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
+    """Imitation of the teacher, if any, and then reinforcement learning."""
+    imitated = min(config.imitation.steps, config.steps)
+    both = (
+        ("imitation", build_imitation, imitated),
+        ("learning", build_reinforcement, config.steps),
+    )
+    return [
+        Phase(name, functools.partial(build, config, low, device), until)
+        for name, build, until in both
+        if until > 0
+    ]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -146,16 +177,11 @@ def main(arguments: list[str] | None = None) -> int:
             "code": __version__,
             "benchmark": EDITION,
         }
-        imitated = min(config.imitation.steps, config.steps)
-        phases = [
-            Phase(name, functools.partial(build, config, low, args.device, imitating), until)
-            for name, imitating, until in (
-                ("imitation", True, imitated),
-                ("reinforcement", False, config.steps),
-            )
-            if until > 0
-        ]
-        run(args, config, phases, meta, summarise, Interruption(args.time_limit))
+        run = Run(
+            args.out, config, meta, summarise, Interruption(args.time_limit), args.worker_timeout,
+            worker_link(args), args.init,
+        )  # fmt: skip
+        run.train(phases(config, low, args.device), args.resume)
     except ValueError as error:
         print(f"train_high.py: {error}", file=sys.stderr)
         return 2

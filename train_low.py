@@ -21,7 +21,9 @@ from tqdm import tqdm
 from tdgc import __version__, policies
 from tdgc.calibration import calibrate
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, to_dict
-from tdgc.learn.training import Interruption, Phase, add_arguments, configure, run
+from tdgc.learn.flags import add_arguments, configure, worker_link
+from tdgc.learn.ppo import NoiseScaledRate, shared_keywords
+from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
@@ -104,29 +106,15 @@ def build(
         link=link,
     )
     ppo = config.ppo
-    first, last = ppo.learning_rate, ppo.final_learning_rate
     (obs_index, obs_sign), (act_index, act_sign) = probe.observation_mirror, probe.action_mirror
     mirror = Mirror(*(tuple(x.tolist()) for x in (obs_index, obs_sign, act_index, act_sign)))
-
-    def learning_rate(remaining: float) -> float:
-        """Linear over the run, times the exploration noise: see ``PPOConfig``."""
-        std = float(model.policy.log_std.detach().exp().mean()) if built else ppo.initial_std
-        return (last + remaining * (first - last)) * std
-
-    built = False
+    rate = NoiseScaledRate(ppo.learning_rate, ppo.final_learning_rate, ppo.initial_std)
     model = PPO(
         AsymmetricActorCriticPolicy,
         env,
-        learning_rate=learning_rate,
-        n_steps=ppo.n_steps,
+        learning_rate=rate,
         batch_size=ppo.batch_size,
-        n_epochs=ppo.n_epochs,
-        gamma=ppo.gamma,
-        gae_lambda=ppo.gae_lambda,
-        clip_range=ppo.clip_range,
-        ent_coef=ppo.ent_coef,
-        vf_coef=ppo.vf_coef,
-        max_grad_norm=ppo.max_grad_norm,
+        **shared_keywords(ppo),
         policy_kwargs={
             "actor_dim": probe.actor_dim,
             "mirror": mirror if ppo.mirror else None,
@@ -138,7 +126,7 @@ def build(
         seed=config.seed,
         device=device,
     )
-    built = True
+    rate.log_std = model.policy.log_std
     probe.close()
     return model, env
 
@@ -157,7 +145,11 @@ def main(arguments: list[str] | None = None) -> int:
             "benchmark": EDITION,
         }
         interruption = Interruption(args.time_limit)
-        if run(args, config, phases(config, args.device), meta, summarise, interruption):
+        run = Run(
+            args.out, config, meta, summarise, interruption, args.worker_timeout,
+            worker_link(args), args.init,
+        )  # fmt: skip
+        if run.train(phases(config, args.device), args.resume):
             finish(args.out, config, interruption)
     except ValueError as error:
         print(f"train_low.py: {error}", file=sys.stderr)

@@ -58,11 +58,11 @@ _TURNS = 10  # of each place in a comparison
 
 def spread_levels(env: TaskVecEnv, levels: int) -> None:
     """New episodes for all robots, spread over the levels as a training's are."""
-    lasting = ("rng", "tiles_drawn", "command_share", "restarts")
+    kept = ("rng", "tiles_drawn", "landing", "command_share", "restarts")
     env.load_state_dicts(
         [
             {
-                **{key: state[key] for key in lasting},
+                **{key: state[key] for key in kept},
                 "level": np.arange(len(state["level"])) % levels,
             }
             for state in env.state_dicts()

@@ -23,7 +23,7 @@ import tdgc
 import train_high
 import train_low
 from tdgc import bench
-from tdgc.learn.training import Interruption
+from tdgc.learn.run import Interruption
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import ActorLink, ClusterError, connect
 from tdgc.parallel.vec import TaskVecEnv, worker_seed

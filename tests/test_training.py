@@ -33,19 +33,9 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.learn.training import (
-    CheckpointError,
-    Interruption,
-    add_arguments,
-    append_line,
-    configure,
-    load_learner,
-    newest_checkpoint,
-    read_checkpoint,
-    save_checkpoint,
-    snapshot,
-    workers_of,
-)
+from tdgc.learn.checkpoints import Checkpoint, CheckpointError
+from tdgc.learn.flags import add_arguments, configure
+from tdgc.learn.run import Interruption, append_line
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror
@@ -85,16 +75,16 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
     np.random.normal()  # so that numpy holds back the second of a pair
     position = np.random.normal(size=(4, 3))
     state = {"epoch": 3, "robots": {"position": position}}
-    path = save_checkpoint(tmp_path, *snapshot(model, {"workers": [state], "phase": 1}))
+    path = Checkpoint.take(model, {"workers": [state], "phase": 1}).save(tmp_path)
     assert path == tmp_path / "step-000000000032"
     saved, drawn = parameters(model), draw()
     other = learner(seed=2, steps=16)
     assert any((saved[k] != v).any() for k, v in parameters(other).items())
-    tensors, header = read_checkpoint(path)
-    (worker,) = workers_of(tensors, header)
-    assert worker["epoch"] == 3 and header["phase"] == 1
+    read = Checkpoint.read(path)
+    (worker,) = read.workers()
+    assert worker["epoch"] == 3 and read.header["phase"] == 1
     np.testing.assert_array_equal(worker["robots"]["position"], position)
-    load_learner(other, tensors, header)
+    read.restore(other)
     loaded = parameters(other)
     assert set(loaded) == set(saved) and "0.exp_avg_sq" in saved
     assert all((loaded[k] == saved[k]).all() for k in saved)
@@ -106,7 +96,7 @@ def test_two_checkpoints_are_kept(tmp_path: Path) -> None:
     model = learner(seed=0)
     for steps in (100, 9, 2000, 2000):
         model.num_timesteps = steps
-        save_checkpoint(tmp_path, *snapshot(model, {}))
+        Checkpoint.take(model, {}).save(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["step-000000000100", "step-000000002000"]
 
 
@@ -116,7 +106,7 @@ def three(folder: Path) -> list[Path]:
     made = []
     for steps in (10, 20):
         model.num_timesteps = steps
-        made.append(save_checkpoint(folder / "checkpoints", *snapshot(model, {"at": steps})))
+        made.append(Checkpoint.take(model, {"at": steps}).save(folder / "checkpoints"))
     (folder / "checkpoints" / ".step-000000000030.partial").mkdir()
     return made
 
@@ -124,7 +114,7 @@ def three(folder: Path) -> list[Path]:
 def test_the_newest_checkpoint_is_taken(tmp_path: Path) -> None:
     three(tmp_path)
     warnings: list[str] = []
-    assert newest_checkpoint(tmp_path, warnings.append)[1]["at"] == 20
+    assert Checkpoint.newest(tmp_path, warnings.append).header["at"] == 20
     assert warnings == []
 
 
@@ -170,26 +160,26 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(damage: Any, tmp_path
     before, newest = three(tmp_path)
     damage(newest)
     with pytest.raises(CheckpointError, match=str(newest)) as caught:
-        read_checkpoint(newest)
+        Checkpoint.read(newest)
     assert "\n" not in str(caught.value)
     warnings: list[str] = []
-    assert newest_checkpoint(tmp_path, warnings.append)[1]["at"] == 10
+    assert Checkpoint.newest(tmp_path, warnings.append).header["at"] == 10
     assert len(warnings) == 1 and str(newest) in warnings[0]
     assert warnings[0].endswith("; trying the one before")
     damage(before)
     with pytest.raises(CheckpointError, match=r"no checkpoint that can be read$"):
-        newest_checkpoint(tmp_path, warnings.append)
+        Checkpoint.newest(tmp_path, warnings.append)
 
 
 def test_no_checkpoint_at_all(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"no checkpoint that can be read$"):
-        newest_checkpoint(tmp_path, print)
+        Checkpoint.newest(tmp_path, print)
 
 
 def test_a_checkpoint_of_another_network(tmp_path: Path) -> None:
-    tensors, header = snapshot(learner(seed=0), {})
+    taken = Checkpoint.take(learner(seed=0), {})
     with pytest.raises(CheckpointError, match=r"^the checkpoint does not fit the conf") as caught:
-        load_learner(learner(seed=0, hidden=9), tensors, header)
+        taken.restore(learner(seed=0, hidden=9))
     assert "\n" not in str(caught.value)
 
 
@@ -209,13 +199,13 @@ def no_file_larger_than(size: int) -> Iterator[None]:
 
 def test_a_checkpoint_that_finds_no_room_leaves_those_before(tmp_path: Path) -> None:
     model = learner(seed=0)
-    kept = [save_checkpoint(tmp_path, *snapshot(model, {"at": 0}))]
+    kept = [Checkpoint.take(model, {"at": 0}).save(tmp_path)]
     model.num_timesteps += 1
     with no_file_larger_than(2000), pytest.raises(OSError):
-        save_checkpoint(tmp_path, *snapshot(model, {"at": 1}))
+        Checkpoint.take(model, {"at": 1}).save(tmp_path)
     assert list(tmp_path.iterdir()) == kept
-    assert read_checkpoint(kept[0])[1]["at"] == 0
-    kept.append(save_checkpoint(tmp_path, *snapshot(model, {"at": 2})))
+    assert Checkpoint.read(kept[0]).header["at"] == 0
+    kept.append(Checkpoint.take(model, {"at": 2}).save(tmp_path))
     assert sorted(tmp_path.iterdir()) == kept
 
 
@@ -325,7 +315,7 @@ def newest(run: Path) -> Path:
 def final(run: Path) -> dict[str, Any]:
     """What a run ended with, but for the wall time: the learner's whole state, the policy, the
     counters, the workers' states."""
-    header = read_checkpoint(newest(run))[1]
+    header = Checkpoint.read(newest(run)).header
     timed = ("seconds", "sha256")
     return {
         **{key: value for key, value in header.items() if key not in timed},
@@ -370,9 +360,9 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     with monkeypatch.context() as patch:
         at_calls(patch, stop)
         assert train_low.main([*TINY, "--out", str(broken)]) == 0
-    stopped = read_checkpoint(newest(broken))
-    assert stopped[1]["num_timesteps"] == 32 and stopped[1]["phase"] == 0
-    under_way = [state["lengths"] for state in workers_of(*stopped)]
+    stopped = Checkpoint.read(newest(broken))
+    assert stopped.steps == 32 and stopped.header["phase"] == 0
+    under_way = [state["lengths"] for state in stopped.workers()]
     assert 0 < np.max(under_way) < 20  # of episodes of 20 steps
     last = broken / "checkpoints/step-000000000096"
     kill_run("train_low.py", ["--resume", "--out", str(broken)], last)
@@ -413,14 +403,14 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     with monkeypatch.context() as patch:
         at_calls(patch, lambda call, run: setattr(run, "reason", "a test" if call == 2 else None))
         assert train_high.main([*arguments, "--out", str(broken)]) == 0
-    stopped = read_checkpoint(newest(broken))[1]
-    assert stopped["num_timesteps"] == 8 and stopped["phase"] == 0
+    stopped = Checkpoint.read(newest(broken))
+    assert stopped.steps == 8 and stopped.header["phase"] == 0
     kill_run("train_high.py", ["--resume", "--out", str(broken)], last, after=0.05)
-    tensors, header = read_checkpoint(newest(broken))
-    assert header["num_timesteps"] < 40
-    (state,) = workers_of(tensors, header)
+    cut = Checkpoint.read(newest(broken))
+    assert cut.steps < 40
+    (state,) = cut.workers()
     assert state["lengths"].max() > 0  # episodes have 7 decisions, so the third update cuts them
-    assert tensors["lstm.pi.h"].any()
+    assert cut.tensors["lstm.pi.h"].any()
     assert train_high.main(["--resume", "--out", str(broken)]) == 0
     assert final(broken) == final(whole)
 
@@ -499,9 +489,9 @@ def test_faults_of_a_run(
         "train_low.py: 3 faults of workers within 1000 steps; the last one: worker 0 died "
         "(exit code -9)"
     )
-    tensors, header = read_checkpoint(newest(tmp_path))
-    assert header["num_timesteps"] == 96 and header["workers"][0]["restarts"] == 3
-    assert all(tensor.isfinite().all() for tensor in tensors.values())
+    last = Checkpoint.read(newest(tmp_path))
+    assert last.steps == 96 and last.header["workers"][0]["restarts"] == 3
+    assert all(tensor.isfinite().all() for tensor in last.tensors.values())
     assert not multiprocessing.active_children()
 
 
@@ -557,7 +547,7 @@ def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return configure(LowTrainConfig(), parser.parse_args(flags)).workers
 
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(3)))
-    monkeypatch.setattr("tdgc.learn.training.usable_cores", lambda: usable_cores(tmp_path))
+    monkeypatch.setattr("tdgc.learn.flags.usable_cores", lambda: usable_cores(tmp_path))
     assert workers() == workers("--set", "workers=2") == 2
     assert workers("--workers", "auto") == 3
     assert workers("--workers", "auto", "--n-envs", "25") == 2

@@ -59,7 +59,7 @@ def worker_seed(seed: int, worker: int, restarts: int = 0) -> int:
     return int(np.random.SeedSequence([seed, worker, restarts]).generate_state(1)[0])
 
 
-def lasting(state: State) -> State:
+def without_episodes(state: State) -> State:
     """A worker's state without the episodes under way."""
     under_way = ("episodes", "obs", "returns", "lengths")
     return {key: value for key, value in state.items() if key not in under_way}
@@ -132,7 +132,7 @@ class TaskVecEnv(VecEnv):
         if self._broken:
             self.close()
             raise self._broken[min(self._broken)]
-        self._states: list[State] = [lasting(state) for state in states]
+        self._states: list[State] = [without_episodes(state) for state in states]
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
 
@@ -280,7 +280,7 @@ class TaskVecEnv(VecEnv):
             if isinstance(state, WorkerError):
                 state = self._states[k]
             else:
-                self._states[k] = lasting(state)
+                self._states[k] = without_episodes(state)
                 rows = self._rows[k]
                 state |= copies({"returns": self._returns[rows], "lengths": self._lengths[rows]})
             states.append({**state, "restarts": self._restarts[k]})
@@ -311,7 +311,7 @@ class TaskVecEnv(VecEnv):
         self._receive_all()
         if self._broken:
             raise self._broken[min(self._broken)]
-        self._states = [lasting(state) for state in states]
+        self._states = [without_episodes(state) for state in states]
 
     def close(self) -> None:
         """Stop the workers, gently and then not."""

@@ -502,7 +502,7 @@ class LowLevelTask:
         self.level = np.clip(self.level, 0, top)
 
     def _count(self, terms: dict[str, Array], reward: Array, terminated: NDArray[np.bool_]) -> None:
-        """Add this step to ``stats`` (sums; ``tdgc.learn.training`` divides and logs them)."""
+        """Add this step to ``stats`` (sums; ``tdgc.learn.run`` divides and logs them)."""
         loco, stats = self.locomotion, self.stats
 
         def add(key: str, value: float) -> None:

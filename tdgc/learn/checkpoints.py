@@ -1,0 +1,210 @@
+"""Checkpoints: a run between two updates, to go on from as if it had not been stopped.
+
+A checkpoint is a folder with ``state.safetensors`` (parameters, optimiser, LSTM states, the
+workers' arrays) and ``state.json`` (counters, random states, the rest of the workers' states, and a
+checksum of all of it). No file can run code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch as th
+from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from tdgc import __version__
+from tdgc.errors import InputError
+from tdgc.state import State, join, split
+
+_KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
+_VERSION = 3
+#: Names of what the recurrent learner remembers of the episodes under way.
+_LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
+
+
+class CheckpointError(InputError):
+    """A checkpoint or run folder that cannot be used; the message is one line."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """The learner's whole state and that of its workers.
+
+    Attributes:
+        tensors: by name.
+        header: all that is no tensor: ``num_timesteps``, ``n_updates``, ``random``, and what the
+            run adds, ``workers``, ``phase`` and ``seconds`` of wall time.
+    """
+
+    tensors: dict[str, th.Tensor]
+    header: dict[str, Any]
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of the run so far."""
+        return int(self.header["num_timesteps"])
+
+    @classmethod
+    def take(cls, model: BaseAlgorithm, extra: dict[str, Any]) -> Checkpoint:
+        """Of a learner between two updates, and of ``extra``."""
+        tensors = {f"policy.{k}": v for k, v in model.policy.state_dict().items()}
+        optimiser = model.policy.optimizer.state_dict()
+        for index, slots in optimiser["state"].items():
+            tensors |= {f"optimizer.{index}.{k}": th.as_tensor(v) for k, v in slots.items()}
+        memory: RNNStates | None = getattr(model, "_last_lstm_states", None)
+        if memory is not None:
+            tensors |= zip(_LSTM, (*memory.pi, *memory.vf), strict=True)
+        arrays: dict[str, NDArray[Any]] = {}
+        extra = split(extra, "extra", arrays)
+        tensors |= {name: th.from_numpy(array) for name, array in arrays.items()}
+        random_tensors, random_states = _random_states()
+        header = {
+            "format": "tdgc-checkpoint",
+            "version": _VERSION,
+            "code": __version__,
+            "num_timesteps": model.num_timesteps,
+            "n_updates": model._n_updates,
+            "random": random_states,
+            **extra,
+        }
+        return cls(tensors | random_tensors, header)
+
+    @classmethod
+    def read(cls, path: Path) -> Checkpoint:
+        """From its folder.
+
+        Raises:
+            CheckpointError: missing, damaged or foreign files.
+        """
+        try:
+            data = (path / "state.safetensors").read_bytes()
+            header = json.loads((path / "state.json").read_bytes())
+            known = isinstance(header, dict) and header.get("format") == "tdgc-checkpoint"
+            if not known or header.get("version") != _VERSION:
+                raise CheckpointError(f"{path}: not a tdgc checkpoint of version {_VERSION}")
+            for counter in ("num_timesteps", "n_updates"):
+                if type(header.get(counter)) is not int or not 0 <= header[counter] < 2**63:
+                    raise CheckpointError(f"{path}: '{counter}' is no count")
+            if _checksum(data, header) != header["sha256"]:
+                raise CheckpointError(f"{path}: its checksum does not match, it is damaged")
+            return cls(safetensors.torch.load(data), header)
+        except CheckpointError:
+            raise
+        except (OSError, ValueError, KeyError, RuntimeError, safetensors.SafetensorError) as error:
+            raise CheckpointError(f"{path}: cannot be read: {error}") from error
+
+    @classmethod
+    def newest(cls, run: Path, warn: Callable[[str], None]) -> Checkpoint:
+        """The newest of a run that can be read; damaged ones are passed over with a warning.
+
+        Raises:
+            CheckpointError: the run has none.
+        """
+        for path in sorted((run / "checkpoints").glob("step-*"), reverse=True):
+            try:
+                return cls.read(path)
+            except CheckpointError as error:
+                warn(f"{error}; trying the one before")
+        raise CheckpointError(f"{run}: no checkpoint that can be read")
+
+    def save(self, folder: Path) -> Path:
+        """Write it; a reader sees it complete or not at all.
+
+        Raises:
+            OSError: it cannot be written; those before it are left as they are.
+        """
+        data = safetensors.torch.save({k: v.contiguous() for k, v in self.tensors.items()})
+        header = json.loads(json.dumps(self.header))  # as a reader will have it
+        text = json.dumps({**header, "sha256": _checksum(data, header)})
+        final = folder / f"step-{self.steps:012d}"
+        partial = folder / f".{final.name}.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        try:
+            for name, content in (("state.safetensors", data), ("state.json", text.encode())):
+                with open(partial / name, "wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+            shutil.rmtree(final, ignore_errors=True)
+            os.replace(partial, final)
+        except OSError:
+            shutil.rmtree(partial, ignore_errors=True)  # it may be what fills the disk
+            raise
+        for old in sorted(folder.glob("step-*"))[:-_KEEP]:
+            shutil.rmtree(old)
+        return final
+
+    def restore(self, model: BaseAlgorithm) -> None:
+        """Put parameters, optimiser, counters and random states into ``model``.
+
+        Raises:
+            CheckpointError: parameters of another shape or name.
+        """
+        tensors = self.tensors
+        try:
+            policy = {k: v for k, v in tensors.items() if k.startswith("policy.")}
+            model.policy.load_state_dict({k.removeprefix("policy."): v for k, v in policy.items()})
+            state = model.policy.optimizer.state_dict()
+            state["state"] = {}
+            for key, value in tensors.items():
+                if key.startswith("optimizer."):
+                    _, index, slot = key.split(".")
+                    state["state"].setdefault(int(index), {})[slot] = value
+            model.policy.optimizer.load_state_dict(state)
+        except (RuntimeError, KeyError, ValueError) as error:
+            line = str(error).splitlines()[0]
+            raise CheckpointError(
+                f"the checkpoint does not fit the configuration: {line}"
+            ) from error
+        if _LSTM[0] in tensors:
+            h_pi, c_pi, h_vf, c_vf = (tensors[name].to(model.device) for name in _LSTM)
+            cast(Any, model)._last_lstm_states = RNNStates(pi=(h_pi, c_pi), vf=(h_vf, c_vf))
+        model.num_timesteps = self.steps
+        model._n_updates = int(self.header["n_updates"])
+        _restore_random(tensors, self.header["random"])
+
+    def workers(self) -> list[State]:
+        """The workers' states, see ``TaskVecEnv.load_state_dicts``."""
+        arrays = {k: v.numpy() for k, v in self.tensors.items() if k.startswith("extra.")}
+        states: list[State] = join(self.header["workers"], arrays)
+        return states
+
+
+def _checksum(data: bytes, header: dict[str, Any]) -> str:
+    """Of the tensors' file and of all that stands beside it in the header."""
+    rest = {key: value for key, value in header.items() if key != "sha256"}
+    return hashlib.sha256(data + json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def _random_states() -> tuple[dict[str, th.Tensor], dict[str, Any]]:
+    name, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)
+    version, words, carry = random.getstate()
+    states = {"numpy": [position, has_gauss, gauss], "python": [version, carry], "kind": name}
+    tensors = {
+        "random.torch": th.get_rng_state(),
+        "random.numpy": th.from_numpy(np.asarray(keys).astype(np.int64)),
+        "random.python": th.tensor(words, dtype=th.int64),
+    }
+    return tensors, states
+
+
+def _restore_random(tensors: dict[str, th.Tensor], states: dict[str, Any]) -> None:
+    th.set_rng_state(tensors["random.torch"].to(th.uint8))
+    keys = tensors["random.numpy"].numpy().astype(np.uint32)
+    np.random.set_state((states["kind"], keys, *states["numpy"]))
+    version, carry = states["python"]
+    random.setstate((version, tuple(tensors["random.python"].tolist()), carry))

@@ -1,0 +1,76 @@
+"""The flags of both trainers, and the configuration that follows from them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from tdgc.config import Config, ConfigError, read_json, recorded, to_dict, with_overrides
+from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
+from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
+from tdgc.parallel.worker import MakeLink, ProcessLink
+
+
+def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
+    """The flags of both trainers; ``out`` is the default run folder."""
+    parser.add_argument("--seed", type=int, help="of everything random (42)")
+    parser.add_argument("--n-envs", type=int, help="robots altogether")
+    parser.add_argument(
+        "--workers", type=workers_flag, metavar="N",
+        help="processes that simulate, or auto: one a core, each with 10 robots at least",
+    )  # fmt: skip
+    parser.add_argument(
+        "--worker-timeout", type=float, default=300.0, metavar="S",
+        help="start a worker anew that is silent for S seconds (300)",
+    )  # fmt: skip
+    parser.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
+    parser.add_argument("--steps", type=int, help="steps altogether")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds")
+    parser.add_argument("--device", default="cpu", help="where the learner runs (cpu)")
+    parser.add_argument("--out", type=Path, default=Path(out), help=f"run folder ({out})")
+    parser.add_argument("--resume", action="store_true", help="go on with the run in --out")
+    parser.add_argument("--init", type=Path, help="start from this policy instead of anew")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
+        help="change the configuration, e.g. ppo.n_steps=48",
+    )  # fmt: skip
+
+
+def configure(config: Config, args: argparse.Namespace) -> Config:
+    """Configuration of the run: the folder's when resuming, else ``config``, then the flags.
+
+    With ``--cluster`` this process joins it.
+
+    Raises:
+        ConfigError: nothing to resume, a folder in use, or an assignment that cannot be used.
+        ClusterError: a cluster that cannot be used, or has fewer CPUs than there are workers.
+    """
+    stored = args.out / "config.json"
+    if args.resume:
+        if not stored.is_file():
+            raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
+        try:
+            config = recorded(type(config), read_json(stored), stored)
+        except ConfigError as error:
+            raise ConfigError(
+                f"{error}; a run of another version cannot go on: start one in another folder, "
+                f"with --init {args.out / 'policy'} to begin from its policy"
+            ) from error
+    elif stored.exists():
+        raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
+    flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
+    given = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
+    config = with_overrides(config, [*given, *args.assignments])
+    cores = usable_cores() if args.cluster is None else connect(args.cluster)
+    if args.workers == "auto" and not args.resume:  # a run goes on with as many as it began with
+        workers = auto_workers(to_dict(config)["n_envs"], cores)
+        config = with_overrides(config, [f"workers={workers}"])
+    workers = to_dict(config)["workers"]
+    if args.cluster is not None:
+        check_workers(workers, cores)
+    return config
+
+
+def worker_link(args: argparse.Namespace) -> MakeLink:
+    """What starts a worker: a process of this machine, or with ``--cluster`` an actor of Ray."""
+    return ProcessLink if args.cluster is None else ActorLink

@@ -1,0 +1,360 @@
+"""A run of a trainer: its folder, its phases, the learning loop, logs and interruption.
+
+A run folder holds ``config.json``, ``log.jsonl`` (a row every ``log_steps``), TensorBoard's event
+files, ``policy.safetensors`` with ``policy.json`` (the last policy, ready to be used) and
+``checkpoints/`` with the two newest states, from which a run goes on, in the middle of its
+episodes, as if it had not been stopped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import math
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol, cast
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.policies import ActorCriticPolicy
+from tqdm import tqdm
+
+from tdgc import policies
+from tdgc.config import to_dict
+from tdgc.learn.checkpoints import Checkpoint
+from tdgc.parallel.vec import TaskVecEnv, without_episodes
+from tdgc.parallel.worker import MakeLink, WorkerError, memory_mb
+
+
+class TrainConfig(Protocol):
+    """What the configurations of both trainers have in common."""
+
+    @property
+    def steps(self) -> int: ...
+
+    @property
+    def log_steps(self) -> int: ...
+
+    @property
+    def checkpoint_seconds(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of a run with its own environment.
+
+    Attributes:
+        name: for the progress bar.
+        build: makes the learner and its workers, given their ``timeout`` and what starts one.
+        until: steps of the run at which the phase ends.
+    """
+
+    name: str
+    build: Callable[[float, MakeLink], tuple[Any, TaskVecEnv]]
+    until: int
+
+
+class Interruption:
+    """Turns SIGINT, SIGTERM and a time limit into one flag that the loop looks at."""
+
+    def __init__(self, time_limit: float | None) -> None:
+        self.reason: str | None = None
+        self._deadline = None if time_limit is None else time.monotonic() + time_limit
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self.reason is not None:  # asked twice: stop at once
+            raise KeyboardInterrupt
+        self.reason = signal.Signals(number).name
+
+    def due(self) -> bool:
+        """Whether to stop now."""
+        if self.reason is None and self._deadline is not None:
+            if time.monotonic() > self._deadline:
+                self.reason = "the time limit"
+        return self.reason is not None
+
+    def tell(self, run: Path) -> None:
+        """Say what stopped the run in the folder ``run``, and how it goes on."""
+        tqdm.write(f"stopped by {self.reason}; --resume --out {run} goes on")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of a trainer.
+
+    Attributes:
+        folder: where it keeps everything.
+        config: of the whole run; written to the folder.
+        meta: goes into the policy's file.
+        summarise: sums of all workers -> values to log.
+        interruption: when to stop.
+        worker_timeout: s, after which a silent worker is started again.
+        link: what starts a worker.
+        init: a policy to begin from.
+    """
+
+    folder: Path
+    config: TrainConfig
+    meta: dict[str, Any]
+    summarise: Callable[[dict[str, float]], dict[str, float]]
+    interruption: Interruption
+    worker_timeout: float
+    link: MakeLink
+    init: Path | None = None
+
+    def train(self, phases: Sequence[Phase], resume: bool) -> bool:
+        """Go through the phases in order, from the newest checkpoint with ``resume``.
+
+        Returns:
+            Whether it came to its end; False when it was interrupted.
+
+        Raises:
+            CheckpointError: nothing to resume that can be read.
+            ValueError: a policy in ``init`` that does not fit.
+            WorkerError: too many faults of workers; a checkpoint was written.
+            OSError: files that cannot be written, among them the last checkpoint.
+        """
+        last = Checkpoint.newest(self.folder, tqdm.write) if resume else None
+        if self.init is not None:
+            policies.load(self.init)  # before anything is written
+        self.folder.mkdir(parents=True, exist_ok=True)
+        config = json.dumps(to_dict(self.config), indent=2)
+        (self.folder / "config.json").write_text(config, encoding="utf-8")
+        unsaved: OSError | None = None
+        for number, phase in enumerate(phases):
+            if last is not None and last.steps >= phase.until:
+                continue
+            last, finished, unsaved = self._go_through(phase, number, last)
+            if not finished:
+                break
+        else:
+            finished = True
+        if unsaved is not None:
+            raise unsaved
+        if not finished:
+            self.interruption.tell(self.folder)
+        return finished
+
+    def _go_through(
+        self, phase: Phase, number: int, last: Checkpoint | None
+    ) -> tuple[Checkpoint, bool, OSError | None]:
+        """One phase from where ``last`` left the run: how it stands then, whether it came to the
+        phase's end, and why that could not be written, if it could not."""
+        model, env = phase.build(self.worker_timeout, self.link)
+        try:
+            model.set_logger(tensorboard_logger(self.folder / "tensorboard"))
+            if last is not None:
+                last.restore(model)
+                states = last.workers()
+                if last.header["phase"] != number:  # episodes end with a phase, levels go on
+                    states = [without_episodes(state) for state in states]
+                env.load_state_dicts(states)
+            else:
+                if self.init is not None:
+                    policies.load_into(self.init, model.policy)
+                env.reset()
+            # What the robots saw last, as after a rollout of this learner.
+            model._last_obs, model._last_episode_starts = env.seen(), env.starts()
+            model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
+            seconds = 0.0 if last is None else float(last.header["seconds"])
+            callback = RunCallback(self, env, phase.name, number, seconds)
+            try:
+                finished = learn(model, callback, phase.until)
+            except WorkerError:
+                callback.tell_faults()
+                callback.save()
+                raise
+            return callback.save(), finished, callback.unsaved
+        finally:
+            env.close()
+
+
+class RunCallback(BaseCallback):
+    """Progress, logs and checkpoints of a phase.
+
+    Args:
+        run: that it is a phase of.
+        env: the workers.
+        name, number: of the phase.
+        seconds_before: wall time of the run so far.
+
+    Attributes:
+        unsaved: why the last checkpoint could not be written, or None.
+    """
+
+    def __init__(
+        self, run: Run, env: TaskVecEnv, name: str, number: int, seconds_before: float
+    ) -> None:
+        super().__init__()
+        self.run, self.env = run, env
+        self._name, self._number = name, number
+        self._started = time.monotonic() - seconds_before
+        self._saved_at = 0.0
+        self._logged_at = (0, 0.0)
+        self._bar: Any = None
+        self._faults: list[dict[str, Any]] = []  # since the last log row
+        self._tensorboard_failed = False
+        self.unsaved: OSError | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the run, over all its pieces."""
+        return time.monotonic() - self._started
+
+    def _on_training_start(self) -> None:
+        self._saved_at = self.seconds
+        self._logged_at = (self.num_timesteps, self.seconds)
+        self._bar = tqdm(
+            desc=self._name,
+            total=self.run.config.steps,
+            initial=self.num_timesteps,
+            unit="step",
+            unit_scale=True,
+            mininterval=2.0,
+            dynamic_ncols=True,
+        )
+
+    def _on_rollout_start(self) -> None:
+        # Between an update and the next rollout the learner's state is whole. The workers forget in
+        # every run at every rollout, so that a checkpoint may be written at any or at none.
+        self.env.forget()
+        if self.seconds - self._saved_at >= self.run.config.checkpoint_seconds:
+            self.save()
+            self._saved_at = self.seconds
+
+    def _on_step(self) -> bool:
+        self.tell_faults()
+        return True
+
+    def tell_faults(self) -> None:
+        """Tell of the workers that were started again, and keep it for the next log row."""
+        while self.env.faults:
+            fault = self.env.faults.pop(0)
+            tqdm.write(str(fault))
+            self._faults.append({"steps": self.num_timesteps, **dataclasses.asdict(fault)})
+
+    def _on_rollout_end(self) -> None:
+        self._bar.update(self.num_timesteps - self._bar.n)
+        if self.num_timesteps - self._logged_at[0] >= self.run.config.log_steps:
+            self._log()
+
+    def save(self) -> Checkpoint:
+        """Write the policy and a checkpoint, or tell why not; returns the checkpoint."""
+        states = self.env.state_dicts()
+        extra = {"workers": states, "seconds": self.seconds, "phase": self._number}
+        taken = Checkpoint.take(self.model, extra)
+        meta = {**self.run.meta, "steps": taken.steps, "seconds": round(self.seconds)}
+        folder = self.run.folder
+        try:
+            # The policy first: it is refused when it is not finite, and a checkpoint should be.
+            policies.save(folder / "policy", cast(ActorCriticPolicy, self.model.policy), meta)
+            taken.save(folder / "checkpoints")
+            self.unsaved = None
+        except OSError as error:
+            self.unsaved = error
+            tqdm.write(f"no checkpoint at {taken.steps} steps, the one before stays: {error}")
+        return taken
+
+    def _log(self) -> None:
+        sums: dict[str, float] = {}
+        for part in self.env.stats():
+            for key, value in part.items():
+                sums[key] = sums.get(key, 0.0) + value
+        values = self.run.summarise(sums)
+        steps, seconds = self._logged_at
+        values["time/steps_per_s"] = (self.num_timesteps - steps) / (self.seconds - seconds)
+        lengths = [e["l"] for e in self.model.ep_info_buffer or ()]
+        if lengths:
+            returns = [e["r"] for e in self.model.ep_info_buffer or ()]
+            values["episode/return"] = float(np.mean(returns))
+            values["episode/length"] = float(np.mean(lengths))
+        for name in (
+            "imitation_loss", "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction",
+            "std", "learning_rate",
+        ):  # fmt: skip
+            number = self.logger.name_to_value.get(f"train/{name}")
+            if number is not None:
+                values[f"train/{name}"] = float(number)
+        memory = sums.get("memory_mb", 0.0) + memory_mb(os.getpid())
+        if math.isfinite(memory):
+            values["memory/mb"] = memory
+        values["faults/blow_ups"] = sums.get("blow_ups", 0.0)
+        values["faults/restarts"] = float(len(self._faults))
+        row: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self.seconds, 1)}
+        row |= {k: _short(v) for k, v in values.items()} | {"faults": self._faults}
+        try:
+            append_line(self.run.folder / "log.jsonl", json.dumps(row))
+            if self._tensorboard_failed:  # its writer never recovers from an error
+                self.model.set_logger(tensorboard_logger(self.run.folder / "tensorboard"))
+            for key, value in values.items():
+                self.logger.record(key, value)
+            self.logger.dump(self.num_timesteps)
+            self._faults, self._tensorboard_failed = [], False
+        except OSError as error:
+            self._tensorboard_failed = True
+            tqdm.write(f"no log row at {self.num_timesteps} steps: {error}")
+        self._logged_at = (self.num_timesteps, self.seconds)
+
+    def _on_training_end(self) -> None:
+        self._bar.close()
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.5g}")
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a file, all of it or nothing.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    data = f"{line}\n".encode()
+    with open(path, "ab", buffering=0) as file:
+        end = file.tell()
+        if file.write(data) < len(data):  # the disk had room for a part
+            file.truncate(end)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+def learn(model: Any, callback: RunCallback, until: int) -> bool:
+    """SB3's learning loop, up to ``until`` steps; False when it was interrupted.
+
+    Like ``OnPolicyAlgorithm.learn``, but it stops between two updates and never inside one, so
+    that a checkpoint written then is whole.
+
+    Raises:
+        WorkerError: too many faults of workers; the learner is as after the last update.
+    """
+    model._total_timesteps = until
+    callback.init_callback(model)
+    callback.on_training_start(locals(), globals())
+    updated_at = model.num_timesteps
+    try:
+        while model.num_timesteps < until and not callback.run.interruption.due():
+            model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+            model._update_current_progress_remaining(model.num_timesteps, until)
+            model.train()
+            updated_at = model.num_timesteps
+    except WorkerError:
+        model.num_timesteps = updated_at  # nothing was learned from the steps since
+        raise
+    finally:
+        callback.on_training_end()
+    return bool(model.num_timesteps >= until)
+
+
+def tensorboard_logger(folder: Path) -> Logger:
+    """SB3's logger, writing TensorBoard's event files only."""
+    return Logger(str(folder), [TensorBoardOutputFormat(str(folder))])
