@@ -3,11 +3,14 @@
 import csv
 import dataclasses
 import json
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
+import onnxruntime
 import pytest
 
 from tdgc import diagnose, export
@@ -474,3 +477,56 @@ def test_without_mujoco_it_says_what_to_install(
     assert runner.main(["--export", str(folder)]) == 2
     said = capsys.readouterr()
     assert "needs mujoco: install the extra 'mujoco'" in said.err and said.err.count("\n") == 1
+
+
+# --- the documents ------------------------------------------------------------------------------
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+def first_cells(name: str, heading: str) -> list[str]:
+    """Names in the first column of the table under a heading of a document."""
+    section = (DOCS / name).read_text().split(f"# {heading}\n")[1].split("\n## ")[0]
+    rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    return [name for row in rows for name in re.findall("`([^`]+)`", row)]
+
+
+def test_the_loop_in_the_document_is_the_controllers(folder: Path, controller: Controller) -> None:
+    code = (DOCS / "deploy.md").read_text().split("```python\n")[1].split("```")[0]
+    given: dict[str, Any] = {"np": np}
+    exec(code, given)
+    graphs = {
+        name: (
+            onnxruntime.InferenceSession(folder / f"{name}.onnx"),
+            json.loads((folder / f"{name}_interface.json").read_text()),
+        )
+        for name in ("low", "high")
+    }
+    world = make_world()
+    place(world)
+    memory: dict[str, Any] = {"low": None, "high": None}
+    latest: dict[str, Any] = {}
+    controller.reset()
+    for step in range(12):
+        state = world.state
+        readings = controller.sense(state, np.array([7.0, 4.0]), "rough", world.ground_height)
+        timed = readings | {"time_left": np.array([20.0 - 0.02 * step])}
+        for entry in graphs["high"][1]["order"]:
+            if step % entry["every"] == 0:
+                name = entry["graph"]
+                memory[name] = given["run"](*graphs[name], timed, memory[name], latest)
+        targets = controller.step(readings)
+        assert memory["low"]["joint_targets"] == pytest.approx(targets, abs=1e-9)
+        world.step(np.tile(targets, (3, 1, 1)), np.zeros(1), np.zeros((1, 12)))
+
+
+def test_documents_name_what_there_is(
+    controller: Controller, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = [field.name for field in dataclasses.fields(MujocoConfig)]
+    assert first_cells("mujoco.md", "Physics") == settings
+    assert set(first_cells("deploy.md", "Logs")) == {"time", *log.layout(controller)}
+    with pytest.raises(SystemExit):
+        runner.main(["--help"])
+    flags = re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, flags=re.MULTILINE)
+    assert set(first_cells("mujoco.md", "A second simulator")) == set(flags)
