@@ -14,7 +14,8 @@ from pathlib import Path
 
 from tdgc.benchmark import diagnosis, trace
 from tdgc.deploy import log
-from tdgc.deploy.controller import Controller, require
+from tdgc.deploy.controller import Controller
+from tdgc.deploy.interface import require
 from tdgc.sim.geometry import read_geometry
 
 

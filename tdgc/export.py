@@ -33,16 +33,8 @@ from torch import Tensor, nn
 from tdgc import __version__
 from tdgc.benchmark.drivers import HierarchyDriver, load_high
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
-from tdgc.deploy.controller import (
-    FORMATS,
-    VERSION,
-    Controller,
-    Table,
-    checksum,
-    interface_path,
-    quiet,
-    require,
-)
+from tdgc.deploy.controller import FORMATS, Controller, quiet
+from tdgc.deploy.interface import VERSION, Table, checksum, interface_path, require
 from tdgc.policies import Policy
 from tdgc.sim.commands import (
     CONTINUOUS,

@@ -34,7 +34,8 @@ from tdgc.benchmark.flags import choose, choose_levels
 from tdgc.benchmark.recording import Recorder, Recording
 from tdgc.benchmark.results import describe, write_results
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
-from tdgc.deploy.controller import Controller, require
+from tdgc.deploy.controller import Controller
+from tdgc.deploy.interface import require
 from tdgc.deploy.log import LogWriter
 from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.show import film

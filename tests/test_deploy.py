@@ -11,7 +11,8 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from tdgc import export
-from tdgc.deploy.controller import GRAPHS, SCHEMA, Controller, ExportError, read_interface
+from tdgc.deploy.controller import GRAPHS, Controller
+from tdgc.deploy.interface import SCHEMA, ExportError, read_interface
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import RobotState
 from tdgc.tasks.high_env import PRETRAINED

@@ -18,7 +18,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
-from tdgc.deploy.controller import FORMATS, ExportError, Graph
+from tdgc.deploy.controller import FORMATS, Graph
+from tdgc.deploy.interface import ExportError
 from tdgc.export import TOLERANCE, HighLevel, LowLevel
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy

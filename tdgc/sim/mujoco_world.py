@@ -10,6 +10,7 @@ import contextlib
 import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -26,12 +27,8 @@ from tdgc.sim.world import GRAVITY, WindowError, World, check_display
 _CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
 _NAME = "ground"
 _BASE = 0.5  # m of ground under its lowest point: MuJoCo's height fields are solid
-_GROUND, _TRUNK, _FOOT, _LEG = (
-    -1,
-    0,
-    1,
-    5,
-)  # parts of a contact; a foot and a leg above it, plus 0-3
+# Parts that a geom belongs to: the ground, the trunk, a foot, a leg above it (plus 0-3 each).
+_GROUND, _TRUNK, _FOOT, _LEG = -1, 0, 1, 5
 
 
 @dataclass(frozen=True)
@@ -46,9 +43,7 @@ class MujocoConfig:
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
     impratio: float = 100.0
     friction: float = 0.8  # foot on ground, nominal (benchmark)
-    armature: float = (
-        0.01  # kg m^2 about each joint, of its motor's rotor: as in models of such robots
-    )
+    armature: float = 0.01  # kg m^2, rotor of each joint's motor: as in models of such robots
     joint_friction: float = 0.0  # N m in each joint, dry
 
     def physics(self, control_dt: float, joint_rate: float) -> PhysicsConfig:
@@ -61,12 +56,12 @@ class MujocoConfig:
         Raises:
             ConfigError: ``timestep`` does not divide the joint control's step.
         """
-        substeps, hold = round(control_dt / self.timestep), round(1.0 / joint_rate / self.timestep)
-        if not np.allclose(
-            [substeps * self.timestep, hold * self.timestep * joint_rate], [control_dt, 1.0]
-        ):
+        joint_dt = 1.0 / joint_rate
+        substeps, hold = round(control_dt / self.timestep), round(joint_dt / self.timestep)
+        steps = np.array([substeps, hold]) * self.timestep
+        if not np.allclose(steps, [control_dt, joint_dt]):
             raise ConfigError(
-                f"'timestep' must divide the joint control's step, {1.0 / joint_rate:g} s, not "
+                f"'timestep' must divide the joint control's step, {joint_dt:g} s, not "
                 f"{self.timestep:g}"
             )
         return PhysicsConfig(control_dt, substeps, hold, friction=self.friction)
@@ -120,7 +115,7 @@ class MujocoWorld(World):
         mujoco.mj_kinematics(model, self.data)
         feet = self.state.foot_body[0]  # at joint angles 0 and the trunk at the origin, as there
         for leg in range(4):
-            mine = np.flatnonzero(parts == _LEG + leg)
+            mine = np.flatnonzero((parts == _LEG + leg) & (model.geom_contype > 0))
             away = np.linalg.norm(self.data.geom_xpos[mine] - feet[leg], axis=1)
             parts[mine[away.argmin()]] = _FOOT + leg
         return parts
@@ -191,11 +186,7 @@ def _build(
     """The robot above its ground."""
     path = urdf_path(robot)
     try:
-        spec = (
-            _with_visuals(path.read_text(encoding="utf-8"))
-            if visual
-            else mujoco.MjSpec.from_file(str(path))
-        )
+        spec = _with_visuals(path) if visual else mujoco.MjSpec.from_file(str(path))
         spec.compiler.fusestatic = False  # it would weld the trunk to the world
         spec.worldbody.first_body().add_freejoint()
         _add_ground(spec, field)
@@ -205,9 +196,9 @@ def _build(
         raise ConfigError(f"{path}: MuJoCo cannot load it: {error}") from error
 
 
-def _with_visuals(urdf: str) -> mujoco.MjSpec:
+def _with_visuals(urdf: Path) -> mujoco.MjSpec:
     """The robot with its visual shapes, which MuJoCo would leave out; but for those of meshes."""
-    tree = ElementTree.fromstring(urdf)
+    tree = ElementTree.fromstring(urdf.read_text(encoding="utf-8"))
     for link in tree.iter("link"):
         for shape in link.findall("visual"):
             if shape.find("geometry/mesh") is not None:
@@ -219,7 +210,8 @@ def _with_visuals(urdf: str) -> mujoco.MjSpec:
 
 def _add_ground(spec: mujoco.MjSpec, field: TileField) -> None:
     """The field's surface. MuJoCo splits a cell along the other diagonal than Bullet, up to 5 mm
-    apart on rough ground, so the field is turned by a quarter: x runs along its columns."""
+    apart on rough ground, so the field is turned by a quarter: its columns are along y, and its
+    rows against x."""
     half_x, half_y = 0.5 * field.cell * (np.array(field.heights.shape) - 1)
     low, high = float(field.heights.min()), float(field.heights.max())
     spec.add_hfield(
@@ -249,19 +241,14 @@ def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
     for geom in spec.geoms:
         geom.solref, geom.condim = [config.solref, 1.0], 3
         geom.friction[0] = config.friction  # of two in contact MuJoCo takes the larger
-        if (
-            geom.name != _NAME and geom.contype
-        ):  # a robot meets the ground and not itself, as in Bullet
+        if geom.name != _NAME:  # a robot meets the ground and not itself, as in Bullet
             geom.conaffinity = 0
     for joint in spec.joints:
         if joint.name not in JOINTS:
             continue
         # All that moves a joint beside its torque is told here, whatever the URDF says.
-        joint.armature, joint.frictionloss, joint.damping = (
-            config.armature,
-            config.joint_friction,
-            [0.0, 0.0, 0.0],
-        )
+        joint.armature, joint.frictionloss = config.armature, config.joint_friction
+        joint.damping = [0.0, 0.0, 0.0]
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         joint.solref_limit = [config.solref, 1.0]
 
