@@ -238,6 +238,7 @@ def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
     option = spec.option
     option.timestep, option.gravity = config.timestep, [0.0, 0.0, -GRAVITY]
     option.cone, option.impratio = _CONES[config.cone], config.impratio
+    spec.visual.headlight.ambient = [0.5, 0.5, 0.5]  # the window's only light
     for geom in spec.geoms:
         geom.solref, geom.condim = [config.solref, 1.0], 3
         geom.friction[0] = config.friction  # of two in contact MuJoCo takes the larger
@@ -276,7 +277,10 @@ class Window:
         world = loco.world
         assert isinstance(world, MujocoWorld)
         self._dt, self._due = world.physics.control_dt, time.perf_counter()
-        self._shown = self._open.enter_context(viewer.launch_passive(world.model, world.data))
+        opened = viewer.launch_passive(
+            world.model, world.data, show_left_ui=False, show_right_ui=False
+        )
+        self._shown = self._open.enter_context(opened)
         self._shown.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         self._shown.cam.trackbodyid, self._shown.cam.distance = 1, 2.0
 
