@@ -20,6 +20,7 @@ import dataclasses
 import json
 import shutil
 import sys
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -549,9 +550,17 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
         interface_path(folder, name).write_text(text, encoding="utf-8")
         for form in formats:
             _write_graph(level, folder / (name + FORMATS[form]))
-    shutil.copyfile(
-        urdf_path(pair.low_config.robot), folder / tables["low"]["robot"]["urdf"]["file"]
-    )
+    _copy_robot(urdf_path(pair.low_config.robot), folder)
+
+
+def _copy_robot(urdf: Path, folder: Path) -> None:
+    """Copy a URDF, and those of its meshes that lie beside or below it."""
+    shutil.copyfile(urdf, folder / urdf.name)
+    for mesh in ElementTree.parse(urdf).iter("mesh"):
+        name = Path(mesh.get("filename", ""))
+        if not (name.is_absolute() or ".." in name.parts) and (urdf.parent / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(urdf.parent / name, folder / name)
 
 
 def _write_graph(level: LowLevel | HighLevel, path: Path) -> None:

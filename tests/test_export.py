@@ -25,6 +25,7 @@ from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Mirror, Policy
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
+from tdgc.sim.geometry import urdf_path
 from tdgc.sim.locomotion import (
     ACTOR_LAYOUT,
     GYRO_LAYOUT,
@@ -463,6 +464,28 @@ def test_interface_says_how_to_decide(folder: Path) -> None:
     assert task["horizon"]["unit"] == "s" and task["horizon"]["value"] == pytest.approx(20.0)
     assert task["after_goal"]["keep_deciding"]["value"] == pytest.approx(2.0)
     assert task["family"]["otherwise"] == "unknown"
+
+
+def test_the_robots_meshes_come_along(tmp_path: Path) -> None:
+    urdf = tmp_path / "robot" / "robot.urdf"
+    (urdf.parent / "meshes").mkdir(parents=True)
+    (urdf.parent / "meshes" / "trunk.stl").write_text("solid trunk")
+    (tmp_path / "secret.stl").write_text("not of the robot")
+    text = urdf_path(LOW_CONFIG.robot).read_text()
+    shape = '<geometry><box size="0.3 0.15 0.1"/></geometry>'
+    mesh = '<geometry><mesh filename="{}"/></geometry>'
+    both = [mesh.format(name) for name in ("meshes/trunk.stl", "../secret.stl")]
+    visuals = "</visual><visual>".join(both)
+    urdf.write_text(text.replace(shape, visuals))
+    pair = export.load_pair(LOW, random_high(tmp_path / "high", HIGH_CONFIG))
+    robot = dataclasses.replace(LOW_CONFIG.robot, urdf=str(urdf))
+    pair = dataclasses.replace(pair, low_config=dataclasses.replace(LOW_CONFIG, robot=robot))
+    (tmp_path / "out").mkdir()
+    export.write(pair, tmp_path / "out", [])
+    found = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
+    assert found == {
+        "low_interface.json", "high_interface.json", "robot.urdf", "meshes/trunk.stl"
+    }  # fmt: skip
 
 
 ROBOT = """
