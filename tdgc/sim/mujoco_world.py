@@ -36,10 +36,10 @@ class MujocoConfig:
     """MuJoCo's settings; docs/mujoco.md has what each costs."""
 
     timestep: float = 0.0025  # s, Bullet's on terrain
-    # s and none, of all contacts and joint limits. At MuJoCo's default of 0.02 s feet sink into the
-    # ground and robots fall over stairs.
+    # s, time constant of contacts and joint limits. At MuJoCo's default of 0.02 s feet get 3-4 cm
+    # into the ground, past their centres, and stay there.
     solref: float = 0.005
-    # With friction pyramids and MuJoCo's impratio of 1 feet creep: robots slide off slopes.
+    # With friction pyramids and MuJoCo's impratio of 1 feet creep down slopes.
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
     impratio: float = 100.0
     friction: float = 0.8  # foot on ground, nominal (benchmark)
