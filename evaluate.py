@@ -38,6 +38,7 @@ from tdgc.benchmark.evaluation import (
     run_cell,
     spread,
 )
+from tdgc.benchmark.flags import choose, choose_levels
 from tdgc.benchmark.recording import Recorder, Recording, Together
 from tdgc.benchmark.results import describe, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, check_installed, write
@@ -51,7 +52,7 @@ from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Policy
 from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
-from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
+from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, height_map, is_map
 from tdgc.sim.world import WindowError
 from tdgc.tasks.high_env import PRETRAINED, load_low
 from tdgc.tasks.leaps import measure_landing
@@ -126,44 +127,6 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
     parser.add_argument("--out", type=Path, default=Path("runs/evaluation"), help="results folder")
     return parser.parse_args(arguments)
-
-
-def choose(
-    text: str, allowed: tuple[str, ...], everything: tuple[str, ...], what: str
-) -> tuple[str, ...]:
-    """The names in a comma-separated flag; ``all`` stands for ``everything``.
-
-    Raises:
-        ValueError: a name that is not allowed, or one of them twice.
-    """
-    names = everything if text == "all" else tuple(text.split(","))
-    for name in names:
-        if name not in allowed:
-            raise ValueError(f"unknown {what} '{name}'; allowed: all, {', '.join(allowed)}")
-        if names.count(name) > 1:
-            raise ValueError(f"{what} '{name}' is named twice")
-    return names
-
-
-def choose_levels(text: str) -> tuple[int, ...]:
-    """``6-10`` or ``0,5,10`` as levels.
-
-    Raises:
-        ValueError: not numbers, outside 0-12, or one of them twice.
-    """
-    levels: list[int] = []
-    for part in text.split(","):
-        first, _, last = part.partition("-")
-        try:
-            levels += range(int(first), int(last or first) + 1)
-        except ValueError as error:
-            raise ValueError(f"cannot read --levels '{text}'; write e.g. 6-10 or 0,5,10") from error
-    top = OOD_LEVELS[-1]
-    if not levels or min(levels) < 0 or max(levels) > top:
-        raise ValueError(f"--levels '{text}' must name levels from 0 to {top}")
-    if len(set(levels)) < len(levels):
-        raise ValueError(f"--levels '{text}' names a level twice")
-    return tuple(levels)
 
 
 @dataclass(frozen=True)

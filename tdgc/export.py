@@ -5,8 +5,9 @@
 A graph holds all that stands between a robot's sensors and its joint targets: observation
 (Sec. IV-A, IV-B), network, decoder, phase clock and joint targets. Beside ``low.onnx`` and
 ``low.pt`` stands ``low_interface.json``, which says what goes in and comes out, in which order and
-unit, and how the joints are driven; likewise for ``high``. Afterwards each pair of graphs drives a
-robot in the simulator for as long as an episode, and its outputs are compared with the policies'.
+unit, and how the joints are driven; likewise for ``high``, with the task. The robot's URDF is there
+too. Afterwards each pair of graphs drives a robot in the simulator for as long as an episode, from
+the folder alone (``tdgc.deploy``), and its outputs are compared with the policies'.
 
 All inputs and outputs are vectors of float64. The networks run in float32, as they were trained;
 what surrounds them runs in float64, as in the simulator: a clock in float32 would drift away.
@@ -15,15 +16,12 @@ what surrounds them runs in float64, as in the simulator: a clock in float32 wou
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
-import importlib.util
 import json
-import logging
+import shutil
 import sys
-import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,9 +32,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from tdgc import __version__
-from tdgc.benchmark.drivers import load_high
+from tdgc.benchmark.drivers import HierarchyDriver, load_high
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
-from tdgc.errors import install_hint
+from tdgc.deploy.controller import FORMATS, Controller, quiet
+from tdgc.deploy.interface import VERSION, Table, checksum, interface_path, require
 from tdgc.policies import Policy
 from tdgc.sim.commands import (
     CONTINUOUS,
@@ -50,8 +49,8 @@ from tdgc.sim.commands import (
     observed_command,
 )
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
-from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry
-from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
+from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import Term, width
 from tdgc.sim.robot import (
     HIGHEST_FOOT,
@@ -59,29 +58,30 @@ from tdgc.sim.robot import (
     Array,
     action_scale,
     foot_kinematics,
+    nominal_height,
     nominal_pose,
+    pd_torque,
     target_limits,
 )
-from tdgc.tasks.executor import Executor
+from tdgc.sim.terrain import TileField, make_tile
+from tdgc.sim.world import World
 from tdgc.tasks.high_env import (
     GOAL_SCALE,
     PRETRAINED,
     SEMANTIC,
-    NavigationTask,
     high_layout,
     load_low,
-    observe_high,
 )
-from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBES, height_probes
-from tdgc.tasks.rules import GOING, outcome
+from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBES
+from tdgc.tasks.rules import GOAL_RADIUS, GOING, outcome
 
-#: Formats and the endings of their files.
-FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
 #: Largest difference allowed between graphs and policies, in the units of the outputs: float32
 #: networks of this size differ by about 1e-6 where two libraries add up in another order.
 TOLERANCE = 1e-5
 
-_ONNX_PACKAGES = ("onnx", "onnxruntime", "onnxscript")  # the extra `export` of setup.cfg
+# The extra `export` of setup.cfg; all but the first are for the format onnx.
+_PACKAGES = ("jsonschema", "onnx", "onnxruntime", "onnxscript")
+_CHECKED_ON = "rough"  # where every step differs from the one before
 
 
 # ---------------------------------------------------------------------------------------------
@@ -118,7 +118,8 @@ class Signal:
         meaning: what it is.
         order: the table in the interface file that names the entries.
         previous: of an input, the input or output whose value of the step before it takes.
-        start: of such an input, what it (or each entry) is in the first step.
+        start: of an input, what it (or each entry) is in the first step of an episode.
+        source: of an input, the output of the other graph whose latest value it takes.
     """
 
     name: str
@@ -128,6 +129,7 @@ class Signal:
     order: str | None = None
     previous: str | None = None
     start: float | tuple[float, ...] | None = None
+    source: str | None = None
 
 
 _BODY = (
@@ -147,8 +149,8 @@ class ClippedActor(nn.Module):
         self.low, self.high = th.from_numpy(policy.low), th.from_numpy(policy.high)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(n,) -> (action_dim,), both float32."""
-        return th.as_tensor(self.actor(x[None])[0]).clamp(self.low, self.high)
+        """What the policy's ``actor`` takes for one robot -> (action_dim,), both float32."""
+        return th.as_tensor(self.actor(x)[0]).clamp(self.low, self.high)
 
 
 def foot_phases(clock: Tensor, command: Tensor) -> Tensor:
@@ -242,7 +244,14 @@ class LowLevel(nn.Module):
             *([_GYRO] if config.gyro else []),
             Signal("last_action", NUM_JOINTS, "1", "the last action", "joints", "action", 0.0),
             Signal("action_before", NUM_JOINTS, "1", "before that", "joints", "last_action", 0.0),
-            Signal("commands", NUM_COMMANDS, None, "to follow in this step", "commands"),
+            Signal(
+                "commands",
+                NUM_COMMANDS,
+                None,
+                "to follow in this step",
+                "commands",
+                source="high.commands",
+            ),
             Signal("clock", 1, "1", "share of the gait cycle, in [0, 1)", None, "next_clock", 0.0),
         ]
         if self.counted:
@@ -284,7 +293,7 @@ class LowLevel(nn.Module):
             "clock": clock_signal(clock, command),
             "gait": self._gait(command),
         }
-        action = self.actor(self.row(terms)).double().clamp(-self.limit, self.limit)
+        action = self.actor(self.row(terms)[None]).double().clamp(-self.limit, self.limit)
         run = self.dt * command[INDEX["frequency"]]
         clock = clock + run
         targets = (pose + self.joint_scale * action).clamp(self.lowest, self.highest)
@@ -308,10 +317,10 @@ class HighLevel(nn.Module):
     def __init__(self, policy: Policy, config: HighLevelConfig, low: LowLevelConfig) -> None:
         super().__init__()
         self.actor = ClippedActor(policy)
-        self.lstm = policy._lstm
+        self.remember = policy.remember
         layout = high_layout(config.cues)
         self.row = Row(layout)
-        hidden = self.lstm[1].shape[1]
+        hidden = policy.state_size
         decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
         self.low = _constant(decoder.low[:12])
         self.span = _constant(decoder.high[:12] - decoder.low[:12])
@@ -338,7 +347,14 @@ class HighLevel(nn.Module):
             *_BODY,
             Signal("last_decision", NUM_ACTIONS, "1", "the last", "decision", "decision", 0.0),
             Signal("last_commands", NUM_COMMANDS, None, "the last", "commands", "commands", start),
-            Signal("clock", 1, "1", "the low level's in its coming step"),
+            Signal(
+                "clock",
+                1,
+                "1",
+                "the low level's in its coming step",
+                start=0.0,
+                source="low.next_clock",
+            ),
             *(cues[term.name] for term in layout if term.name in cues),
             Signal("hidden", hidden, "1", "state of the LSTM", None, "next_hidden", 0.0),
             Signal("cell", hidden, "1", "cell of the LSTM", None, "next_cell", 0.0),
@@ -367,8 +383,8 @@ class HighLevel(nn.Module):
         if "probes" in x:
             terms["probes"] = x["probes"].clamp(-PROBE_RANGE, PROBE_RANGE)
         state = (x["hidden"].float()[None], x["cell"].float()[None])
-        hidden, cell = th.lstm_cell(self.row(terms)[None], state, *self.lstm)
-        decision = self.actor(hidden[0]).double()
+        latent, (hidden, cell) = self.remember(self.row(terms)[None], state)
+        decision = self.actor(latent).double()
         return decision, self._decode(decision), hidden[0].double(), cell[0].double()
 
     def _normalise(self, decision: Tensor) -> Tensor:
@@ -418,66 +434,120 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
     return Pair(low_policy, low_config, high_policy, high_config)
 
 
-def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, dict[str, Any]]:
-    """What the two interface files say, by level."""
-    robot, physics = pair.low_config.robot, pair.low_config.physics
-    low_table = _signals(pair.low, low) | {
-        "rate_hz": 1.0 / physics.control_dt,
+def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
+    """What the two interface files say, by graph; ``tdgc.deploy`` has their schema."""
+    config, task = pair.low_config, pair.high_config
+    robot, physics = config.robot, config.physics
+    geometry, urdf = read_geometry(robot), urdf_path(robot)
+    joint_hz = physics.joint_steps / physics.control_dt
+    gaits = [
+        {"name": gait, **dict(zip(NAMES[12:], row, strict=True))}
+        for gait, row in zip(GAITS, GAIT_TABLE.tolist(), strict=True)
+    ]
+    low_table = _head("low", pair.low, low, 1.0 / physics.control_dt) | {
         "joints": JOINTS,
-        "commands": _commands(pair.low_config.commands),
+        "commands": _commands(config.commands),
+        "gaits": gaits,
         "feet": FEET,
-        "gaits": {
-            gait: dict(zip(NAMES[12:], row, strict=True))
-            for gait, row in zip(GAITS, GAIT_TABLE.tolist(), strict=True)
+        "frames": {
+            "trunk": "ahead, left, up",
+            "gravity_when_level": _quantity("1", [0.0, 0.0, -1.0]),
+        },
+        "robot": {
+            "urdf": {"file": urdf.name, "sha256": checksum(urdf)},
+            "link_masses": _quantity("kg", geometry.masses),
+            "total_mass": _quantity("kg", sum(geometry.masses.values())),
+            "standing_height": _quantity("m", robot.base_height),
+        },
+        "start": {
+            "joint_angles": _quantity("rad", nominal_pose(robot).tolist()),
+            "trunk_height": _quantity("m", nominal_height(robot, geometry)),
         },
         "joint_control": {
             "law": "torque = kp (target - angle) - kd speed, within the torque limit; 0 where it "
             "would drive a joint beyond its speed limit",
             "axes": "right-handed: hips about the axis ahead, thighs and calves about the one to "
             "the left; at 0 a leg is straight down",
-            "rate_hz": 1.0 / physics.dt,
-            "kp": {"unit": "N m/rad", "value": [robot.kp] * NUM_JOINTS},
-            "kd": {"unit": "N m s/rad", "value": [robot.kd] * NUM_JOINTS},
-            "torque_limit": {"unit": "N m", "value": robot.torque_limit * 4},
-            "speed_limit": {"unit": "rad/s", "value": robot.speed_limit * 4},
-            "nominal_pose": {"unit": "rad", "value": nominal_pose(robot).tolist()},
+            "rate": _quantity("Hz", joint_hz),
+            "kp": _quantity("N m/rad", [robot.kp] * NUM_JOINTS),
+            "kd": _quantity("N m s/rad", [robot.kd] * NUM_JOINTS),
+            "torque_limit": _quantity("N m", robot.torque_limit * 4),
+            "speed_limit": _quantity("rad/s", robot.speed_limit * 4),
+            "simulated_speed_limit": _quantity("rad/s", [min(robot.speed_limit)] * NUM_JOINTS),
+            "joint_limits": {
+                "unit": "rad",
+                "low": geometry.joint_limits[:, 0].tolist(),
+                "high": geometry.joint_limits[:, 1].tolist(),
+            },
+            "target_margin": _quantity("rad", robot.joint_margin),
         },
     }
-    decimation = pair.high_config.decimation
-    high_table = _signals(pair.high, high) | {
-        "rate_hz": 1.0 / (decimation * physics.control_dt),
-        "control_steps": decimation,
+    step = task.decimation * physics.control_dt
+    high_table = _head("high", pair.high, high, 1.0 / step) | {
+        "order": [{"graph": "high", "every": task.decimation}, {"graph": "low", "every": 1}],
         "joints": JOINTS,
-        "commands": _commands(pair.high_config.commands or pair.low_config.commands),
+        "commands": _commands(task.commands or config.commands),
+        "gaits": gaits,
         "decision": (*CONTINUOUS, "gait"),
         "families": SEMANTIC,
-        "probes": {"unit": "m", "ahead_left": PROBES[pair.high_config.probes].tolist()},
+        "probes": {
+            "ahead_left": _quantity("m", PROBES[task.probes].tolist()),
+            "plane_below_trunk": _quantity("m", robot.base_height),
+            "range": _quantity("m", PROBE_RANGE),
+            "off_map": "nearest border",
+        },
+        "task": {
+            "goal_radius": _quantity("m", GOAL_RADIUS),
+            "horizon": _quantity("s", round(task.episode_seconds / step) * step),
+            "family": {"scope": "whole tile", "otherwise": SEMANTIC[-1]},
+            "after_goal": {
+                "keep_deciding": _quantity("s", round(task.hold_seconds / step) * step),
+                "then": "stand",
+            },
+            "after_horizon": "stand",
+            "stand": {"order": "commands", "value": default_command().tolist()},
+        },
     }
     return {"low": low_table, "high": high_table}
 
 
-def _signals(policy: Policy, level: LowLevel | HighLevel) -> dict[str, Any]:
-    def table(signal: Signal) -> dict[str, Any]:
-        said = {k: v for k, v in dataclasses.asdict(signal).items() if v is not None}
+def _quantity(unit: str, value: Any) -> Table:
+    return {"unit": unit, "value": value}
+
+
+def _head(name: str, policy: Policy, level: LowLevel | HighLevel, rate: float) -> Table:
+    """What both interface files begin with."""
+
+    def table(signal: Signal) -> Table:
+        said = dataclasses.asdict(signal)
         form = {"shape": [said.pop("size")], "type": "float64"}
         return {"name": said.pop("name")} | form | said
 
     return {
+        "version": VERSION,
+        "graph": name,
         "package": f"tdgc {__version__}",
         "policy": {k: v for k, v in policy.meta.items() if k not in ("config", "low")},
+        "normalisation": "inside",
+        "rate": _quantity("Hz", rate),
         "inputs": [table(s) for s in level.inputs],
         "outputs": [table(s) for s in level.outputs],
     }
 
 
-def _commands(ranges: CommandRanges) -> list[dict[str, Any]]:
+def _commands(ranges: CommandRanges) -> list[Table]:
+    """Name, unit and bounds of each command, in order; of the embedding its two values."""
     bounds = CommandDecoder(ranges)
-    columns = zip(NAMES, UNITS, bounds.low.tolist(), bounds.high.tolist(), strict=True)
-    return [dict(zip(("name", "unit", "low", "high"), row, strict=True)) for row in columns]
+    rows = zip(NAMES, UNITS, bounds.low.tolist(), bounds.high.tolist(), strict=True)
+    return [
+        {"name": name, "unit": unit}
+        | ({"low": low, "high": high} if name in CONTINUOUS else {"values": [low, high]})
+        for name, unit, low, high in rows
+    ]
 
 
 def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
-    """Write graphs and interface files of both levels into ``folder``, which exists.
+    """Write graphs and interface files of both levels and the URDF into ``folder``, which exists.
 
     Raises:
         OSError: a file cannot be written.
@@ -487,14 +557,25 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
     tables = interfaces(pair, low, high)
     for name, level in (("low", low), ("high", high)):
         text = json.dumps(tables[name], indent=2) + "\n"
-        (folder / f"{name}_interface.json").write_text(text, encoding="utf-8")
+        interface_path(folder, name).write_text(text, encoding="utf-8")
         for form in formats:
             _write_graph(level, folder / (name + FORMATS[form]))
+    _copy_robot(urdf_path(pair.low_config.robot), folder)
+
+
+def _copy_robot(urdf: Path, folder: Path) -> None:
+    """Copy a URDF, and those of its meshes that lie beside or below it."""
+    shutil.copyfile(urdf, folder / urdf.name)
+    for mesh in ElementTree.parse(urdf).iter("mesh"):
+        name = Path(mesh.get("filename", ""))
+        if not (name.is_absolute() or ".." in name.parts) and (urdf.parent / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(urdf.parent / name, folder / name)
 
 
 def _write_graph(level: LowLevel | HighLevel, path: Path) -> None:
     example = tuple(th.full((s.size,), 0.5, dtype=th.float64) for s in level.inputs)
-    with _quiet():
+    with quiet():
         if path.suffix == FORMATS["torchscript"]:
             traced = th.jit.trace(level, example)  # type: ignore[no-untyped-call]
             th.jit.save(traced, path)
@@ -511,84 +592,8 @@ def _write_graph(level: LowLevel | HighLevel, path: Path) -> None:
         )
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without what the exporters say of themselves: deprecations, operators of torchvision."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        logging.disable(logging.WARNING)
-        try:
-            yield
-        finally:
-            logging.disable(logging.NOTSET)
-
-
 # ---------------------------------------------------------------------------------------------
-# Running and checking
-
-
-class Graph:
-    """A graph from a folder that ``write`` filled, run on one thread as a robot would run it.
-
-    Attributes:
-        memory: values of the inputs that come from the step before, by name.
-        seconds: CPU time of the last step, which is its latency on a core of its own.
-    """
-
-    def __init__(self, folder: Path, name: str, form: str) -> None:
-        table = json.loads((folder / f"{name}_interface.json").read_text(encoding="utf-8"))
-        self._inputs = [s["name"] for s in table["inputs"]]
-        self._outputs = [s["name"] for s in table["outputs"]]
-        self._kept = {s["name"]: s["previous"] for s in table["inputs"] if "previous" in s}
-        self._start = {
-            s["name"]: np.full(s["shape"], s["start"]) for s in table["inputs"] if "start" in s
-        }
-        self._run = _RUNTIMES[form](folder / (name + FORMATS[form]), self._inputs)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin a new episode."""
-        self.memory, self.seconds = dict(self._start), 0.0
-
-    def __call__(self, values: dict[str, Array]) -> dict[str, Array]:
-        """One step, inputs by name -> outputs by name; what else ``values`` holds does not matter.
-
-        Inputs that come from the step before are in ``memory`` unless given.
-        """
-        known = self.memory | values
-        inputs = [known[name] for name in self._inputs]
-        started = time.thread_time()
-        outputs = self._run(inputs)
-        self.seconds = time.thread_time() - started
-        known |= dict(zip(self._outputs, outputs, strict=True))
-        self.memory = {name: known[source] for name, source in self._kept.items()}
-        return {name: known[name] for name in self._outputs}
-
-
-Run = Callable[[list[Array]], list[Array]]
-
-
-def _open_onnx(path: Path, inputs: list[str]) -> Run:
-    import onnxruntime  # type: ignore[import-untyped]
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    return lambda values: session.run(None, dict(zip(inputs, values, strict=True)))
-
-
-def _open_torchscript(path: Path, inputs: list[str]) -> Run:
-    with _quiet():
-        module = th.jit.load(path)  # type: ignore[no-untyped-call]
-
-    def run(values: list[Array]) -> list[Array]:
-        with th.inference_mode():
-            return [out.numpy() for out in module(*map(th.from_numpy, values))]
-
-    return run
-
-
-_RUNTIMES = {"onnx": _open_onnx, "torchscript": _open_torchscript}
+# Checking
 
 
 @dataclass(frozen=True)
@@ -605,34 +610,13 @@ class Check:
     seconds: Array
 
 
-class _LowGraph:
-    """The low policy's graph as what acts, with the policy beside it.
-
-    Attributes:
-        differences: of each step's action, one after another.
-        targets: (12,) rad, the last step's joint targets.
-    """
-
-    def __init__(self, graph: Graph, policy: Policy, limit: float, task: NavigationTask) -> None:
-        self._graph, self._policy, self._limit, self._task = graph, policy, limit, task
-        self.differences: list[Array] = []
-        self.targets = np.zeros(NUM_JOINTS)
-
-    def predict(self, obs: ArrayLike) -> tuple[Array, None]:
-        """The graph's action, (1, 12), from what the robot senses; the policy's from ``obs``."""
-        wanted = np.clip(self._policy.predict(obs)[0], -self._limit, self._limit)
-        command = self._task.locomotion.command[0].copy()  # the graph remembers it
-        made = self._graph(_sense(self._task) | {"commands": command})
-        self.differences.append(made["action"] - wanted[0])
-        self.targets = made["joint_targets"]
-        return made["action"][None], None
-
-
 def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     """Let the graphs in ``folder`` drive a robot for as long as an episode, policies beside them.
 
-    The policies see the robot through the simulator's own observation, with their own clock and
-    LSTM state. A robot that falls or leaves its tile starts anew.
+    What drives is read from the folder alone: sensors, probes, task, order and joint control. The
+    policies see the same robot through the simulator's own observation, with their own
+    configurations, clock and LSTM state. A robot that falls, leaves its tile or reaches its goal
+    starts again.
 
     Args:
         folder: where ``write`` wrote.
@@ -640,71 +624,57 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
         low, high: the policies' paths.
 
     Raises:
-        ValueError: policies that cannot be used.
+        ValueError: policies or a folder that cannot be used.
     """
-    pair = load_pair(low, high)
-    config, limit = pair.high_config, pair.low_config.robot.action_limit
-    decide, walk = Graph(folder, "high", form), Graph(folder, "low", form)
-    task = NavigationTask(config, low, 1, seed=0, training=False)
-    loco = task.locomotion
-    acting = _LowGraph(walk, pair.low, limit, task)
-    executor = Executor(loco, acting)
+    pair, controller = load_pair(low, high), Controller(folder, form)
+    config, limit = pair.low_config, pair.low_config.robot.action_limit
+    driver = HierarchyDriver(pair.high, pair.high_config)
+    decoder = CommandDecoder(driver.bounds, pair.high_config.action_limit)
+    field = TileField((1, 1))
+    field.place(0, 0, make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
+    start, goal = field.starts[:, 0], field.goals[:, 0]
+    physics = dataclasses.replace(config.physics, control_dt=controller.dt)
+    world = World(1, controller.robot(urdf_path(config.robot)), physics, field)
+    loco = Locomotion(1, config.robot, config.physics, field, config.gyro, world=world)
     differences: list[Array] = []
     seconds: list[float] = []
-    ended = True
+    step, ended = 0, True
     try:
-        for _ in range(task.horizon):
+        for _ in range(controller.horizon):
             if ended:
-                task.reset(np.arange(1))
-                decide.reset()
-                walk.reset()
-                walk.memory["clock"] = loco.clock.clock
-                loco.command[:] = decide.memory["last_commands"]
-                state, last = None, np.zeros((1, NUM_ACTIONS), dtype=np.float32)
-            # A new episode has the phases of the one before until its first step.
-            loco.clock.update(loco.command[:, 12:], loco.command[:, INDEX["duration"]])
-            seen = observe_high(
-                loco,
-                task.goal,
-                task.elapsed / task.horizon,
-                task.decoder.normalise(last),
-                task.family_index,
-                config.cues,
-                height_probes(loco, PROBES[config.probes]),
+                controller.reset()
+                loco.command[:] = default_command()
+                loco.place(np.arange(1), start[:, :2], start[:, 2], np.zeros(1))
+                differences.append(world.state.q[0] - nominal_pose(world.robot))
+                driver.begin(loco, goal, _CHECKED_ON)
+                step = 0
+            readings = controller.sense(world.state, goal[0], _CHECKED_ON, field.height_at)
+            targets = controller.step(readings)
+            seconds.append(controller.seconds)
+            driver.command(step)
+            assert driver.action is not None
+            decision = controller.high.values["decision"]
+            loco.command[:] = controller.commands
+            wanted = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
+            action = controller.low.values["action"]
+            error, speed = targets - world.state.q, world.state.qd
+            told, torque = (
+                pd_torque(error, speed, world.strength, robot)
+                for robot in (world.robot, config.robot)
             )
-            last, state = pair.high.predict(seen, state)
-            made = decide(_sense(task) | {"clock": walk.memory["clock"]})
+            loco.act(action[None])
             differences += [
-                made["decision"] - last[0],
-                made["commands"] - task.decoder.decode(made["decision"]),
+                decision - driver.action[0],
+                controller.commands - decoder.decode(decision),
+                action - wanted[0],
+                targets - loco.targets[0, 0],
+                told[0] - torque[0],
             ]
-            task.elapsed += 1
-            for k in range(config.decimation):
-                executor.step(made["commands"][None])
-                differences.append(acting.targets - loco.targets[0, 0])
-                seconds.append(walk.seconds + (decide.seconds if k == 0 else 0.0))
-            ended = outcome(loco.world)[0] != GOING
+            step += 1
+            ended = bool(outcome(world, goal)[0] != GOING)
     finally:
-        task.close()
-    worst = np.abs(np.concatenate(differences + acting.differences)).max()
-    return Check(float(worst), np.array(seconds))
-
-
-def _sense(task: NavigationTask) -> dict[str, Array]:
-    """What the task's one robot would know by its sensors and its map."""
-    loco, state = task.locomotion, task.locomotion.world.state
-    ahead, left = np.cos(state.yaw[0]), np.sin(state.yaw[0])
-    offset = task.goal[0] - state.position[0, :2]
-    return {
-        "gravity": state.gravity[0],
-        "joint_angles": state.q[0] - loco.joint_offset[0],
-        "joint_speeds": state.qd[0],
-        "gyro": state.rotation[0].T @ state.ang_vel[0],
-        "goal": np.array([[ahead, left], [-left, ahead]]) @ offset,
-        "time_left": (task.horizon - task.elapsed) * task.step_seconds,
-        "family": np.eye(len(SEMANTIC))[task.family_index[0]],
-        "probes": height_probes(loco, PROBES[task.config.probes])[0],
-    }
+        world.close()
+    return Check(float(np.abs(np.concatenate(differences)).max()), np.array(seconds))
 
 
 def _choose_formats(text: str) -> list[str]:
@@ -712,12 +682,8 @@ def _choose_formats(text: str) -> list[str]:
     for name in names:
         if name not in FORMATS:
             raise ValueError(f"unknown format '{name}'; allowed: {', '.join(FORMATS)}")
-    missing = [name for name in _ONNX_PACKAGES if importlib.util.find_spec(name) is None]
-    if "onnx" in names and missing:
-        raise ValueError(
-            f"format onnx needs {', '.join(missing)}: {install_hint('export')}, "
-            "or use --format torchscript"
-        )
+    onnx = "onnx" in names
+    require(f"format {text}", _PACKAGES if onnx else _PACKAGES[:1], "export")
     return names
 
 

@@ -2,10 +2,12 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -16,21 +18,32 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
-from tdgc.export import FORMATS, TOLERANCE, Graph, HighLevel, LowLevel
+from tdgc.deploy.controller import FORMATS, Graph
+from tdgc.deploy.interface import ExportError
+from tdgc.export import TOLERANCE, HighLevel, LowLevel
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
+from tdgc.sim.geometry import urdf_path
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import JOINTS, nominal_pose
-from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_layout, load_low, observe_high
+from tdgc.tasks.high_env import (
+    PRETRAINED,
+    NavigationTask,
+    high_layout,
+    high_mirror,
+    load_low,
+    observe_high,
+)
 from tdgc.tasks.low_observation import low_mirror
 from tdgc.tasks.probes import PROBES, height_probes
 
 LOW = PRETRAINED / "low"
 LOW_POLICY, LOW_CONFIG = load_low(LOW)
 HIGH_CONFIG = HighLevelConfig(commands=LOW_CONFIG.commands)
+TURNED = {"unit": "rad", "value": (nominal_pose(LOW_CONFIG.robot) + 0.01).tolist()}
 
 
 def unbounded(size: int) -> spaces.Box:
@@ -52,9 +65,10 @@ def random_high(
     """A high level with random weights, saved as ``train_high.py`` saves one."""
     size = width(high_layout(config.cues))
     limit = config.action_limit
+    mirror = high_mirror(config) if config.probes == "lines" else None
     policy = FastRecurrentPolicy(
         unbounded(size), spaces.Box(-limit, limit, (13,)), lambda _: 1e-3,
-        lstm_hidden_size=hidden, net_arch={"pi": [hidden or 8], "vf": [4]},
+        lstm_hidden_size=hidden, net_arch={"pi": [hidden or 8], "vf": [4]}, mirror=mirror,
     )  # fmt: skip
     shake(policy)
     trained_on = {"config": to_dict(low), "observation": LOW_POLICY.actor_dim}
@@ -131,6 +145,16 @@ def folder(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A high level of episodes of a second, and the pair beside it as TorchScript."""
+    path = tmp_path_factory.mktemp("short")
+    config = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
+    pair = export.load_pair(LOW, random_high(path / "policy", config))
+    export.write(pair, path, ["torchscript"])
+    return path
+
+
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """Undo what a script's main does to the process."""
@@ -191,11 +215,21 @@ def test_low_level_is_the_executors_step(
         loco.world.close()
 
 
-@pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])
-def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: str) -> None:
+@pytest.mark.parametrize(
+    ("cues", "probes"),
+    [("both", "lines"), ("both", "staggered"), ("semantic", "lines"), ("geometric", "lines"),
+     ("none", "lines")],
+)  # fmt: skip
+def test_high_level_is_the_tasks_observation_and_decoder(
+    tmp_path: Path, cues: str, probes: str
+) -> None:
+    """With a mirror, and without for probes that are not the same on both sides."""
     narrow = dataclasses.replace(HIGH_CONFIG.commands, vx=(-0.5, 0.8), pitch=(0.0, 0.0))
-    config = HighLevelConfig(cues=cues, action_limit=2.0, decimation=4, commands=narrow)
+    config = HighLevelConfig(
+        cues=cues, probes=probes, action_limit=2.0, decimation=4, commands=narrow
+    )
     policy = policies.load(random_high(tmp_path / "high", config))
+    assert policy.state_size == (64 if probes == "lines" else 32)
     level = HighLevel(policy, config, LOW_CONFIG)
     task = NavigationTask(config, LOW, 5, seed=2, training=False)
     loco, rng = task.locomotion, np.random.default_rng(1)
@@ -204,11 +238,11 @@ def test_high_level_is_the_tasks_observation_and_decoder(tmp_path: Path, cues: s
         disturb(loco, rng)
         loco.clock.update(loco.command[:, 12:], loco.command[:, 5])
         last = rng.uniform(-3.0, 3.0, (5, 13)).astype(np.float32)
-        memory = rng.normal(0.0, 0.5, (2, 5, 32)).astype(np.float32)
+        memory = rng.normal(0.0, 0.5, (2, 5, policy.state_size)).astype(np.float32)
         elapsed = np.arange(5) * 17
         seen = observe_high(
             loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
-            task.family_index, cues, height_probes(loco, PROBES["lines"]),
+            task.family_index, cues, height_probes(loco, PROBES[probes]),
         )  # fmt: skip
         wanted, (hidden, cell) = policy.predict(seen, (memory[:1], memory[1:]))
         state = loco.world.state
@@ -311,6 +345,51 @@ def test_check_finds_other_weights(tmp_path: Path) -> None:
     assert export.check(tmp_path, "torchscript", LOW, other).difference > TOLERANCE
 
 
+def without_sources(table: dict[str, Any]) -> None:
+    """Forget which inputs come from the other graph."""
+    for signal in table["inputs"]:
+        signal["source"] = None
+
+
+@pytest.mark.parametrize(
+    ("graph", "change", "refused"),
+    [
+        ("low", lambda t: t["frames"]["gravity_when_level"].update(value=[0.0, 0.0, 1.0]), ""),
+        ("low", lambda t: t["joint_control"]["kp"].update(value=[21.0] * 12), ""),
+        ("low", lambda t: t["joint_control"]["kd"].update(value=[0.5] * 12), ""),
+        ("low", lambda t: t["rate"].update(value=25.0), ""),
+        ("low", lambda t: t["start"].update(joint_angles=TURNED), "the start pose differs"),
+        ("low", lambda t: t["start"]["trunk_height"].update(value=0.31), "m high"),
+        ("low", without_sources, "low: nothing gives its input 'commands'"),
+        ("high", without_sources, ""),
+        ("high", lambda t: t["order"].reverse(), "order["),
+        ("high", lambda t: t["order"][0].update(every=4), ""),
+        ("high", lambda t: t["probes"]["plane_below_trunk"].update(value=0.31), ""),
+        ("high", lambda t: t["probes"]["ahead_left"]["value"].reverse(), ""),
+        ("high", lambda t: t["families"].reverse(), ""),
+        ("high", lambda t: t["task"]["horizon"].update(value=2.0), ""),
+    ],
+)
+def test_check_finds_an_interface_that_says_something_else(
+    short: Path,
+    tmp_path: Path,
+    graph: str,
+    change: Callable[[dict[str, Any]], None],
+    refused: str,
+) -> None:
+    for file in short.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    high, path = tmp_path / "policy", tmp_path / f"{graph}_interface.json"
+    table = json.loads(path.read_text())
+    change(table)
+    path.write_text(json.dumps(table))
+    if refused:
+        with pytest.raises(ExportError, match=re.escape(refused)):
+            export.check(tmp_path, "torchscript", LOW, high)
+    else:
+        assert export.check(tmp_path, "torchscript", LOW, high).difference > TOLERANCE
+
+
 @pytest.mark.parametrize("form", FORMATS)
 def test_clock_does_not_drift(folder: Path, form: str) -> None:
     """1000 steps at 3.7 Hz: a step of 0.02 s rounded to float32 would be 3e-8 off by then."""
@@ -350,33 +429,81 @@ def test_interface_names_what_the_graph_has(folder: Path, name: str) -> None:
         assert {x.type for x in found} == {"tensor(double)"}
     names = {s["name"] for side in ("inputs", "outputs") for s in table[side]}
     for signal in table["inputs"] + table["outputs"]:
-        assert signal["meaning"] and signal.get("previous") in {None, *names}
-        assert ("previous" in signal) == ("start" in signal)
-        assert "unit" in signal or signal["order"] == "commands"
-        if "order" in signal:
+        assert signal["meaning"] and signal["previous"] in {None, *names}
+        handed_on = signal["previous"] is not None or signal["source"] == "low.next_clock"
+        assert handed_on == (signal["start"] is not None)
+        assert (signal["unit"] is None) == (signal["order"] == "commands")
+        if signal["order"] is not None:
             order = table[signal["order"]]
-            assert (
-                len(order.get("ahead_left") if isinstance(order, dict) else order)
-                == (signal["shape"][0])
-            )
+            order = order["ahead_left"]["value"] if isinstance(order, dict) else order
+            assert len(order) == signal["shape"][0]
 
 
 def test_interface_says_how_to_drive_the_joints(folder: Path) -> None:
     table = json.loads((folder / "low_interface.json").read_text())
-    assert table["rate_hz"] == 50.0 and table["joints"] == list(JOINTS)
-    control = table["joint_control"]
-    assert control["rate_hz"] == pytest.approx(400.0)
+    assert table["rate"] == {"unit": "Hz", "value": 50.0} and table["joints"] == list(JOINTS)
+    control, robot = table["joint_control"], LOW_CONFIG.robot
+    assert control["rate"]["value"] == LOW_CONFIG.physics.joint_steps * 50.0
     assert control["kp"] == {"unit": "N m/rad", "value": [20.0] * 12}
     assert control["kd"] == {"unit": "N m s/rad", "value": [0.6] * 12}
     assert control["torque_limit"] == {"unit": "N m", "value": [23.7, 23.7, 35.5] * 4}
-    assert control["nominal_pose"]["value"] == nominal_pose(LOW_CONFIG.robot).tolist()
+    assert control["speed_limit"] == {"unit": "rad/s", "value": [30.0, 30.0, 20.0] * 4}
+    assert control["simulated_speed_limit"] == {"unit": "rad/s", "value": [20.0] * 12}
+    assert control["joint_limits"]["low"][:3] == [-0.86, -0.69, -2.82]
+    assert control["joint_limits"]["high"][:3] == [0.86, 4.5, -0.89]
+    assert control["target_margin"] == {"unit": "rad", "value": robot.joint_margin}
+    assert table["start"]["joint_angles"]["value"] == nominal_pose(robot).tolist()
+    # 0.213 m each: thighs at 0.8 and 1 rad, calves at -0.7 and -0.5, and 22 mm of foot below
+    rear = 0.213 * (np.cos(1.0) + np.cos(0.5))
+    front = 0.213 * (np.cos(0.8) + np.cos(0.7))
+    hip = 0.08 * np.sin(0.1)
+    height = max(front, rear) * np.cos(0.1) - hip + 0.022
+    assert table["start"]["trunk_height"]["value"] == pytest.approx(height, abs=1e-9)
+    assert table["robot"]["urdf"]["file"] == "quadruped.urdf"
+    assert table["robot"]["total_mass"]["value"] == pytest.approx(12.6)
+    assert table["robot"]["link_masses"]["value"]["trunk"] == 5.6
     assert table["feet"] == ["FL", "FR", "RL", "RR"]
-    assert table["gaits"]["trot"] == {"phase": 0.5, "offset": 0.0, "bound": 0.0}
+    assert table["gaits"][0] == {"name": "trot", "phase": 0.5, "offset": 0.0, "bound": 0.0}
     assert table["commands"][4] == {"name": "frequency", "unit": "Hz", "low": 2.0, "high": 4.0}
+    assert table["commands"][13] == {"name": "offset", "unit": "1", "values": [0.0, 0.5]}
+
+
+def test_interface_says_how_to_decide(folder: Path) -> None:
     table = json.loads((folder / "high_interface.json").read_text())
-    assert table["rate_hz"] == pytest.approx(10.0) and table["control_steps"] == 5
+    assert table["rate"]["value"] == pytest.approx(10.0)
+    assert table["order"] == [{"graph": "high", "every": 5}, {"graph": "low", "every": 1}]
     assert table["policy"] == {"seed": 7}
     assert table["families"][-1] == "unknown" and table["decision"][-1] == "gait"
+    assert table["probes"]["plane_below_trunk"] == {"unit": "m", "value": 0.3}
+    clock = next(s for s in table["inputs"] if s["name"] == "clock")
+    assert (clock["source"], clock["start"]) == ("low.next_clock", 0.0)
+    task = table["task"]
+    assert task["goal_radius"] == {"unit": "m", "value": 0.5}
+    assert task["horizon"]["unit"] == "s" and task["horizon"]["value"] == pytest.approx(20.0)
+    assert task["after_goal"]["keep_deciding"]["value"] == pytest.approx(2.0)
+    assert task["family"]["otherwise"] == "unknown"
+
+
+def test_the_robots_meshes_come_along(tmp_path: Path) -> None:
+    urdf = tmp_path / "robot" / "robot.urdf"
+    (urdf.parent / "meshes").mkdir(parents=True)
+    (urdf.parent / "meshes" / "trunk.stl").write_text("solid trunk")
+    (tmp_path / "secret.stl").write_text("not of the robot")
+    text = urdf_path(LOW_CONFIG.robot).read_text()
+    shape = '<geometry><box size="0.3 0.15 0.1"/></geometry>'
+    mesh = '<geometry><mesh filename="{}"/></geometry>'
+    both = [mesh.format(name) for name in ("meshes/trunk.stl", "../secret.stl")]
+    visuals = "</visual><visual>".join(both)
+    urdf.write_text(text.replace(shape, visuals))
+    pair = export.load_pair(LOW, random_high(tmp_path / "high", HIGH_CONFIG))
+    robot = dataclasses.replace(LOW_CONFIG.robot, urdf=str(urdf))
+    pair = dataclasses.replace(pair, low_config=dataclasses.replace(LOW_CONFIG, robot=robot))
+    (tmp_path / "out").mkdir()
+    export.write(pair, tmp_path / "out", [])
+    found = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
+    assert found == {
+        "low_interface.json", "high_interface.json", "robot.urdf", "meshes/trunk.stl"
+    }  # fmt: skip
 
 
 ROBOT = """
@@ -414,7 +541,7 @@ def test_command_writes_checks_and_reports(
     arguments = ["--high", str(high), "--out", str(out), "--format", "torchscript"]
     assert export.main(arguments) == 0
     assert sorted(path.name for path in out.iterdir()) == [
-        "high.pt", "high_interface.json", "low.pt", "low_interface.json"
+        "high.pt", "high_interface.json", "low.pt", "low_interface.json", "quadruped.urdf"
     ]  # fmt: skip
     said = capsys.readouterr()
     assert said.err == "" and said.out.count("\n") == 1
@@ -456,7 +583,7 @@ def save_pairs(path: Path) -> None:
         ("--high {0}/high --low {0}/absent", "absent.json: no such file"),
         ("--high {0}/high --low {0}/high", "high: not a low-level policy"),
         ("--high {low}", "low: not a high-level policy"),
-        ("--high {0}/fast", "commands.vx asks for [-1.0, 1.5], but the low level was trained on"),
+        ("--high {0}/fast", "commands.vx asks for [-1.0, 1.5], but the low policy was trained on"),
         ("--high {0}/slow", "trained for a low level with a control step of 0.01 s, not 0.02"),
         ("--high {0}/blind", "trained for a high level that observes 48 values, not 86"),
         ("--high {0}/high --low {0}/dizzy", "dizzy: its configuration gives "),
@@ -487,5 +614,5 @@ def test_missing_package_names_the_extra(
     out = tmp_path / "out"
     assert export.main(["--high", str(high), "--out", str(out)]) == 2
     said = capsys.readouterr()
-    assert "format onnx needs onnxscript: install the extra 'export'" in said.err
+    assert "format onnx,torchscript needs onnxscript: install the extra 'export'" in said.err
     assert said.err.count("\n") == 1 and not out.exists()

@@ -26,7 +26,9 @@ FLOORS = (
     ("parallel",),
     ("tasks",),
     ("learn", "benchmark"),
-    ("show", "bench", "calibration", "export"),
+    ("deploy",),
+    ("show", "bench", "calibration", "export", "diagnose"),
+    ("mujoco",),
     ("train_low", "train_high", "evaluate"),
     ("ablate",),
 )
@@ -145,6 +147,13 @@ def test_only_world_imports_pybullet(module: str) -> None:
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     bullet = [name for name in imports(tree) if name.startswith("pybullet")]
     assert bool(bullet) == (module == "sim.world"), f"{module}: {bullet}"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_only_mujoco_world_imports_mujoco(module: str) -> None:
+    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+    found = [name for name in imports(tree) if name.partition(".")[0] == "mujoco"]
+    assert bool(found) == (module == "sim.mujoco_world"), f"{module}: {found}"
 
 
 @pytest.mark.parametrize("module", MODULES)

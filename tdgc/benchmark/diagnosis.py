@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tdgc.benchmark.evaluation import Episode, EpisodeRecord, tile_of
-from tdgc.benchmark.trace import TRACKED, Trace
+from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import (
     GOAL_BEGIN,
@@ -46,6 +46,17 @@ SETTLE = 1.0  # s at the start that are not: speeding up from rest, as in the tr
 #: centre a trunk was hit at up to 0.25 m from a pillar's edge, and a robot held up by one stood at
 #: up to 0.29 m.
 REACH = 0.2
+
+
+#: What a log of a real robot may lack, and a column of the trace that then is empty.
+_TRUTH = {
+    "velocity": "error_vx",
+    "yaw rate": "error_yaw_rate",
+    "trunk height": "base_height",
+    "contacts": "contact_FL",
+    "forces": "trunk_force",
+    "place on a tile": "base_x",
+}
 
 
 @dataclass(frozen=True)
@@ -98,7 +109,8 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
     """Which layer failed in the episode of ``trace``, and why.
 
     Args:
-        trace: of an episode that failed.
+        trace: of an episode that failed. Where it was on no tile, what a simulator alone knows is
+            missing: the evidence says so.
         hips: m, how far ahead of the trunk's centre the robot's hips are.
 
     Raises:
@@ -106,10 +118,12 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
     """
     if trace.outcome == "reached":
         raise ValueError("an episode that reached its goal has not failed")
-    tile = tile_of(trace.seed, trace.family, trace.level, trace.episode)
-    x, y = float(trace["base_x"][-1]), float(trace["base_y"][-1])
-    found = sorted(features(tile, x, y), key=lambda feature: feature[1])
-    feature = f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
+    tile, place, feature = None, "", ""
+    if trace.seed != NO_TILE:
+        tile = tile_of(trace.seed, trace.family, trace.level, trace.episode)
+        x, y = float(trace["base_x"][-1]), float(trace["base_y"][-1])
+        found = sorted(features(tile, x, y), key=lambda feature: feature[1])
+        place, feature = place_of(x), f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
     layer, cause, evidence = _judge(trace, tile, hips)
     return Diagnosis(
         trace.policy,
@@ -120,7 +134,7 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
         trace.seed,
         trace.outcome,
         round(float(trace["time"][-1]), 2),
-        place_of(x),
+        place,
         feature,
         layer,
         cause,
@@ -131,11 +145,15 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
 # ---------------------------------------------------------------------------- which layer
 
 
-def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
+def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[str, str, str]:
     """Layer, cause and evidence."""
     intervals, x, y = judged(trace), trace["base_x"], trace["base_y"]
     # Near a pillar a robot may be held up by it.
-    held = to_pillars(tile, x, y).min(axis=1, initial=np.inf) < hips + REACH
+    held, at_trench = np.zeros(len(x), dtype=bool), False
+    if tile is not None:
+        held = to_pillars(tile, x, y).min(axis=1, initial=np.inf) < hips + REACH
+        away = to_trenches(tile, x[-1]).min(initial=np.inf)
+        at_trench = bool(away < hips + REACH) and trace.outcome != "left_tile"
     # Against a pillar or over the edge nothing is tracked, and that is no fault of who tracks.
     errors = tracking_errors(trace, intervals & ~(held | near_edge(trace, hips))[1:])
     limits = {
@@ -145,9 +163,9 @@ def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
     lost = [name for name, error in errors.items() if error > limits[name]]
     towards = asked_towards(trace, intervals)
     evidence = _evidence(trace, intervals, errors, limits, towards)
-    away = to_trenches(tile, x[-1]).min(initial=np.inf)
-    at_trench = away < hips + REACH and trace.outcome != "left_tile"
-    down = trace.outcome == "fell" or (trace.outcome == "collided" and not held[-1])
+    # Of a collision on no tile it is said, not measured, that it was not with the ground.
+    tripped = trace.outcome == "collided" and tile is not None and not held[-1]
+    down = trace.outcome == "fell" or tripped
     if trace.family == "mixed" or trace.level > MAX_LEVEL:
         return "terrain", "never trained on", evidence
     if towards < -AWAY:
@@ -161,7 +179,11 @@ def _judge(trace: Trace, tile: Tile, hips: float) -> tuple[str, str, str]:
     if down:
         return "decisions", "lost its footing on the way elsewhere", evidence
     if trace.outcome == "collided":
-        return "decisions", "steered into a pillar", evidence
+        return (
+            "decisions",
+            f"steered into {'an obstacle' if tile is None else 'a pillar'}",
+            evidence,
+        )
     if trace.outcome == "left_tile":
         return "decisions", "steered off the tile", evidence
     if held[-1]:
@@ -183,7 +205,7 @@ def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, flo
     """Sizes of the mean errors over ``intervals`` (n - 1,), by the names of ``LIMITS``.
 
     A mean over gait cycles: what a trunk sways about its command does not count. Empty without an
-    interval.
+    interval; an error that was not measured is left out.
     """
 
     def mean(name: str) -> float:
@@ -192,11 +214,12 @@ def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, flo
 
     if not intervals.any():
         return {}
-    return {
+    errors = {
         "velocity": float(np.hypot(mean("vx"), mean("vy"))),
         "yaw rate": abs(mean("yaw_rate")),
         "tilt": float(np.hypot(mean("pitch"), mean("roll"))),
     }
+    return {name: error for name, error in errors.items() if np.isfinite(error)}
 
 
 def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
@@ -240,6 +263,9 @@ def _evidence(
         share = np.sum(trace[f"at_bound_{name}"][:-1][intervals] != 0.0) / max(intervals.sum(), 1)
         if share > 0.5:
             words.append(f"{name} at its bound {100 * share:.0f} % of the time")
+    if trace.seed == NO_TILE:
+        missing = [what for what, name in _TRUTH.items() if np.isnan(trace[name]).all()]
+        words.append(f"not known: {', '.join(missing)}")
     span = "all along" if trace.outcome == "timeout" else f"in the last {LOOK_BACK:g} s"
     return f"{span}: {'; '.join(words)}"
 

@@ -36,7 +36,8 @@ from tdgc.sim.terrain import (
     make_tile,
     tile_rng,
 )
-from tdgc.tasks.executor import Executor
+from tdgc.sim.world import World
+from tdgc.tasks.executor import Carries, Executor
 from tdgc.tasks.rules import GOING, HORIZON, OUTCOMES, outcome
 
 BATCH = 50  # episodes a world: enough to keep numpy busy, few enough to share out evenly
@@ -209,6 +210,7 @@ class Batch:
         config: of the low policy.
         seed: of the evaluation's tiles.
         visual: keep what pictures of the ground need.
+        make_world: of the field; a Bullet world by default.
 
     Attributes:
         cell, seed: as given.
@@ -219,7 +221,14 @@ class Batch:
         sensors, probes: errors of what the low policy observes and of the height probes.
     """
 
-    def __init__(self, cell: Cell, config: LowLevelConfig, seed: int, visual: bool) -> None:
+    def __init__(
+        self,
+        cell: Cell,
+        config: LowLevelConfig,
+        seed: int,
+        visual: bool = False,
+        make_world: Callable[[TileField], World] | None = None,
+    ) -> None:
         self.cell, self.seed = cell, seed
         condition, rows = CONDITIONS[cell.condition], np.arange(cell.count)
         self.field = TileField((cell.count, 1))
@@ -235,7 +244,8 @@ class Batch:
             self.probes = Noise(condition.noise, episode_draws(cell, seed, _PROBES))
             clock = episode_draws(cell, seed, _CLOCK).uniform(0.0, 1.0, (cell.count,))
         physics = physics_of(config, condition)
-        loco = Locomotion(cell.count, config.robot, physics, self.field, config.gyro, visual)
+        world = make_world(self.field) if make_world is not None else None
+        loco = Locomotion(cell.count, config.robot, physics, self.field, config.gyro, visual, world)
         self.loco, self.origin = loco, self.field.origin(rows, 0)
         loco.friction[:] = physics.friction if condition.friction is None else condition.friction
         loco.payload[:], loco.delay[:] = condition.payload, condition.latency
@@ -362,7 +372,7 @@ def run_cell(
 
 
 def closed_loop(
-    driver: Driver, executor: Executor, batch: Batch, log: EpisodeLog, watcher: Watcher | None
+    driver: Driver, executor: Carries, batch: Batch, log: EpisodeLog, watcher: Watcher | None
 ) -> None:
     """The paper's closed loop (Sec. III), until every episode of a batch has ended."""
     for step in itertools.count():

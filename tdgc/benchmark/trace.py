@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Cell, EpisodeRecord, joint_power
+from tdgc.config import CommandRanges
 from tdgc.errors import InputError, install_hint
 from tdgc.sim.commands import (
     CONTINUOUS,
@@ -116,6 +117,10 @@ _TEXT = tuple(c.name for c in COLUMNS if not c.unit)
 _DECIDED = (*_PROBES, *_ACTIONS, *_COMMANDS, "asked_frequency", "gait", *_AT_BOUND)
 
 
+#: Seed and level of an episode that was on no tile: one of a real robot, say.
+NO_TILE = -1
+
+
 @dataclass(frozen=True, eq=False)
 class Trace(EpisodeRecord):
     """One episode's trace.
@@ -137,6 +142,39 @@ class Trace(EpisodeRecord):
 
 
 _META = tuple(f for f in dataclasses.fields(Trace) if f.name != "columns")
+
+
+def action_columns(action: NDArray[np.floating]) -> dict[str, NDArray[Any]]:
+    """Columns of actions (n, 13)."""
+    return dict(zip(_ACTIONS, action.T.copy(), strict=True))
+
+
+def command_columns(
+    command: Array, carried_out: Array, bounds: CommandRanges
+) -> dict[str, NDArray[Any]]:
+    """Columns of commands (n, 15) and of what was carried out of them (n, 15): the latter, the
+    gait, and which of the former are at their ``bounds``."""
+    columns: dict[str, NDArray[Any]] = dict(zip(_COMMANDS, carried_out.T.copy(), strict=True))
+    columns["asked_frequency"] = command[:, INDEX["frequency"]].copy()
+    columns["gait"] = np.array(GAITS, dtype=object)[gait_index(command)]
+    for j, name in enumerate(CONTINUOUS):
+        low, high = getattr(bounds, name)
+        rounding = 1e-9 * (high - low)
+        at = (command[:, j] >= high - rounding).astype(float)
+        columns[f"at_bound_{name}"] = at - (command[:, j] <= low + rounding)
+    return columns
+
+
+def probe_columns(heights: Array) -> dict[str, NDArray[Any]]:
+    """Columns of the heights (n, 32) under the probes, m."""
+    return dict(zip(_PROBES, heights.T, strict=True))
+
+
+def tilt(gravity: Array) -> tuple[Array, Array]:
+    """Pitch and roll, (n,) rad each, of trunks that see gravity (n, 3): what
+    ``rewards.commanded_gravity`` makes gravity of."""
+    x, y, z = gravity.T
+    return np.arcsin(np.clip(x, -1.0, 1.0)), np.arctan2(-y, -z)
 
 
 class Tracer:
@@ -207,18 +245,11 @@ class Tracer:
         row, command, driver = self._rows[-1], self._loco.command, self._driver
         self._decisions[live] += 1
         if driver.action is not None:
-            row.update(zip(_ACTIONS, driver.action.T.copy(), strict=True))
+            row.update(action_columns(driver.action))
             self._actions = np.stack([self._decoder.normalise(driver.action), self._actions[0]])
-        row.update(zip(_COMMANDS, self._loco.carried_out.T.copy(), strict=True))
-        row["asked_frequency"] = command[:, INDEX["frequency"]].copy()
+        row.update(command_columns(command, self._loco.carried_out, driver.bounds))
         if driver.probes is not None:
-            row.update(zip(_PROBES, driver.probes.T.copy(), strict=True))
-        row["gait"] = np.array(GAITS, dtype=object)[gait_index(command)]
-        for name, j in zip(CONTINUOUS, range(len(CONTINUOUS)), strict=True):
-            low, high = getattr(driver.bounds, name)
-            rounding = 1e-9 * (high - low)
-            at = (command[:, j] >= high - rounding).astype(float)
-            row[f"at_bound_{name}"] = at - (command[:, j] <= low + rounding)
+            row.update(probe_columns(driver.probes))
         share = command_share(command, self._decoder)
         self._shares = np.concatenate([share[None], self._shares[:-1]])
         self._clear()
@@ -227,7 +258,7 @@ class Tracer:
         """Look at a control step of the robots that are still going."""
         loco = self._loco
         state = loco.world.state
-        pitch, roll = self._tilt()
+        pitch, roll = tilt(state.gravity)
         measured = np.stack(
             [*state.heading_vel[:, :2].T, state.ang_vel[:, 2], self._height(), pitch, roll], axis=1
         )
@@ -254,7 +285,7 @@ class Tracer:
         row["base_x"], row["base_y"] = (state.position[:, :2] - self._origin).T
         row["base_z"], row["base_height"] = state.position[:, 2].copy(), self._height()
         row["yaw"] = state.yaw.copy()
-        row["pitch"], row["roll"] = self._tilt()
+        row["pitch"], row["roll"] = tilt(state.gravity)
         row["goal_distance"] = np.linalg.norm(offset, axis=1)
         row["goal_bearing"] = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
         row["family"] = np.full(len(nothing), self._driver.told, object)
@@ -287,11 +318,6 @@ class Tracer:
         world = self._loco.world
         x, y, z = world.state.position.T
         return np.asarray(z - world.support_height(x, y))
-
-    def _tilt(self) -> tuple[Array, Array]:
-        """Pitch and roll, (M,) rad each: what ``rewards.commanded_gravity`` makes gravity of."""
-        x, y, z = self._loco.world.state.gravity.T
-        return np.arcsin(np.clip(x, -1.0, 1.0)), np.arctan2(-y, -z)
 
 
 # ---------------------------------------------------------------------------- files

@@ -82,6 +82,7 @@ class Policy:
         low, high: bounds of the actions, (action_dim,), in the environment's action units.
         tensors: all weights by the name in the file, the critic's too.
         actor: what of them acts, the LSTM apart.
+        state_size: width of h and of c, 0 for "mlp"; with a mirror twice the LSTM's size.
     """
 
     def __init__(self, header: Header, tensors: dict[str, th.Tensor]) -> None:
@@ -95,7 +96,7 @@ class Policy:
         self.high: Array = np.array(header.high, dtype=np.float32)
         self.tensors = tensors
         sides = 1 if header.mirror is None else 2
-        self._hidden = header.lstm and sides * header.lstm
+        self.state_size = sides * header.lstm if header.lstm else 0
         self.actor = Actor(header, tensors)
         self._lstm = [tensors[f"actor_lstm.{t}"] for t in LSTM_TENSORS] if header.lstm else []
         log_std = tensors["log_std"].numpy()
@@ -141,8 +142,8 @@ class Policy:
         batch: Array = np.array(np.atleast_2d(x)[:, : self.actor_dim], dtype=np.float32)
         with one_thread(), th.inference_mode():
             latent = th.from_numpy(batch)
-            if self._hidden is not None:
-                before = self._previous(state, episode_start, len(batch), self._hidden)
+            if self.state_size:
+                before = self._previous(state, episode_start, len(batch), self.state_size)
                 latent, after = self.remember(latent, before)
                 state = (after[0].numpy()[None], after[1].numpy()[None])
             actions: Array = self.actor(latent).numpy()

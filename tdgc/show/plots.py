@@ -36,7 +36,7 @@ from tdgc.tasks.rules import GOAL_RADIUS
 # Okabe and Ito's palette, which colour-blind eyes tell apart.
 POLICY_COLOURS = {
     "tdgc": "#0072B2", "tdgc-tuned": "#009E73", "gp": "#D55E00", "cues": "#CC79A7",
-    "teacher": "#555555",
+    "teacher": "#555555", "tdgc-mujoco": "#56B4E9",
 }  # fmt: skip
 GAIT_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7")
 _GROUND = LinearSegmentedColormap.from_list("ground", ["#ffffff", "#707070"])  # low to high

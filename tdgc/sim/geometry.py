@@ -50,6 +50,7 @@ class Geometry:
         thigh, calf: m, from the thigh joint to the calf joint, and on to the foot's centre.
         foot_radius: m.
         trunk_mass: kg, without what is fixed to the trunk by joints.
+        masses: kg of each link, by name.
         joint_limits: lowest and highest angle of each joint, (12, 2) rad.
     """
 
@@ -59,6 +60,7 @@ class Geometry:
     calf: float
     foot_radius: float
     trunk_mass: float
+    masses: dict[str, float]
     joint_limits: Array
 
 
@@ -139,6 +141,7 @@ def _measure(robot: Element) -> Geometry:
         calf=float(-feet[0, 0]),
         foot_radius=float(feet[0, 1]),
         trunk_mass=_mass(parts[_link_of(joints["FL_hip_joint"], "parent")][0].link),
+        masses={p.link.get("name", ""): _mass(p.link) for own in parts.values() for p in own},
         joint_limits=limits.reshape(len(JOINTS), 2),
     )
 

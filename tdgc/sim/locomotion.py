@@ -30,6 +30,7 @@ from tdgc.sim.robot import (
     commanded_pose,
     foot_kinematics,
     joint_targets,
+    nominal_height,
     nominal_pose,
     yaw_quaternion,
 )
@@ -46,6 +47,8 @@ _HISTORY = 3  # control steps of targets kept: the step, and two before for late
 
 class Locomotion:
     """M robots that take 12 actions each 20 ms and follow 15 commands.
+
+    They are in a new Bullet world, or in ``world`` if there is one.
 
     Attributes:
         command: (M, 15), to be set by the caller.
@@ -66,12 +69,13 @@ class Locomotion:
         field: TileField | None,
         gyro: bool = False,
         visual: bool = False,
+        world: World | None = None,
     ) -> None:
         self.num_robots = num_robots
         self.robot = robot
         self.physics = physics
         self.layout = actor_layout(gyro)
-        self.world = World(num_robots, robot, physics, field, visual)
+        self.world = world or World(num_robots, robot, physics, field, visual)
         self.clock = PhaseClock(num_robots)
         self.nominal = nominal_pose(robot)
         self.command = np.tile(default_command(), (num_robots, 1))
@@ -85,9 +89,9 @@ class Locomotion:
         self.payload = np.zeros(num_robots)
         self.armature = np.zeros(num_robots)
         geometry = self.world.state.geometry
-        # Feet in the nominal pose, (1, 4, 3) m, and how high the trunk is above their soles.
+        # Feet in the nominal pose, (1, 4, 3) m.
         self._feet, _ = foot_kinematics(geometry, self.nominal[None], np.zeros((1, NUM_JOINTS)))
-        self._stand = geometry.foot_radius - self._feet[0, :, 2].min()
+        self._stand = nominal_height(robot, geometry)
         self._pose = self._pose_of = np.empty(0)  # the last ``pose`` and what it followed from
 
     def swing(self) -> Array:

@@ -30,6 +30,12 @@ def nominal_pose(config: RobotConfig) -> Array:
     return np.stack([config.nominal_hip * SIDE, thigh, np.full(4, config.nominal_calf)], 1).ravel()
 
 
+def nominal_height(config: RobotConfig, geometry: Geometry) -> float:
+    """Trunk above the soles in the nominal pose, m."""
+    feet, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
+    return float(geometry.foot_radius - feet[0, :, 2].min())
+
+
 def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swing: Array) -> Array:
     """q0(c, phi): the nominal pose bent to the commanded behaviour, (M, 15), (M, 4) -> (M, 12) rad.
 

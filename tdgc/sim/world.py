@@ -384,11 +384,7 @@ class World:
             offset: (M, 12) rad, error of each joint's zero.
         """
         live, state = self._active, self.state
-        # Targets of each joint control: those of the control step that has taken effect by then.
-        interval = self.physics.hold * self.physics.dt
-        passed = interval * np.arange(self.physics.joint_steps)[:, None]
-        age = np.ceil(np.maximum(delay[live] - passed - 1e-9, 0.0) / self.physics.control_dt)
-        wanted = targets[age.astype(int), live] + offset[live]
+        wanted = self._wanted(targets, delay, offset)
         state.trunk_force = np.zeros(self.num_robots)
         for client in self._clients:
             mine = slice(*np.searchsorted(live, client.robots))
@@ -397,6 +393,15 @@ class World:
         self._read_trunks(live)
         state.derive()
         self._read_contacts()
+
+    def _wanted(self, targets: Array, delay: Array, offset: Array) -> Array:
+        """Targets of each of k joint controls, (k, n, 12) rad for the n active robots: those of the
+        control step that has taken effect by then."""
+        live = self._active
+        interval = self.physics.hold * self.physics.dt
+        passed = interval * np.arange(self.physics.joint_steps)[:, None]
+        age = np.ceil(np.maximum(delay[live] - passed - 1e-9, 0.0) / self.physics.control_dt)
+        return np.asarray(targets[age.astype(int), live] + offset[live])
 
     def _step_client(self, client: _Client, live: NDArray[np.integer], wanted: Array) -> None:
         """All physics steps of one client's robots ``live`` (n,), with ``wanted`` (k, n, 12) rad,

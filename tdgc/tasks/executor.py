@@ -19,6 +19,13 @@ class Acts(Protocol):
         """Observations (n, d) -> actions (n, 12), and what does not matter here."""
 
 
+class Carries(Protocol):
+    """What the closed loop needs of an executor."""
+
+    def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
+        """One control step under ``commands`` (M, 15), in which the robots ``rows`` (n,) act."""
+
+
 class Executor:
     """Robots that carry commands out by a frozen low policy.
 

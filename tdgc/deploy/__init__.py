@@ -1,0 +1,1 @@
+"""The exported pair as a robot runs it, from the exported folder alone."""

@@ -1,0 +1,325 @@
+"""The exported pair as a robot runs it, from nothing but the folder that ``tdgc.export`` wrote.
+
+The export's check does so in Bullet, ``tdgc.mujoco`` in MuJoCo, and a robot's own program has to do
+the same (docs/deploy.md).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from tdgc.config import CommandRanges, RobotConfig
+from tdgc.deploy.interface import ExportError, Table, checksum, read_interface
+from tdgc.sim.commands import CONTINUOUS
+from tdgc.sim.geometry import JOINTS, read_geometry
+from tdgc.sim.robot import NUM_JOINTS, Array, RobotState, nominal_height, nominal_pose
+
+#: Formats of graphs and the suffixes of their files.
+FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
+GRAPHS = ("low", "high")
+
+Run = Callable[[list[Array]], list[Array]]
+
+
+class Graph:
+    """A graph and its interface file, run on one thread as a robot would run it.
+
+    Args:
+        folder: that ``tdgc.export`` wrote.
+        name: low or high.
+        form: of ``FORMATS``.
+
+    Raises:
+        ExportError: an interface or a graph that cannot be used, or one that fits not the other.
+
+    Attributes:
+        table: the interface file.
+        memory: values of the inputs that come from the step before, by name.
+        values: all inputs and outputs of the last step, by name.
+        seconds: CPU time of the last step, which is its latency on a core of its own.
+    """
+
+    def __init__(self, folder: Path, name: str, form: str) -> None:
+        self._name, self.table = name, read_interface(folder, name)
+        inputs = self.table["inputs"]
+        self._inputs = [s["name"] for s in inputs]
+        self._outputs = [s["name"] for s in self.table["outputs"]]
+        self._kept = {s["name"]: s["previous"] for s in inputs if s["previous"] is not None}
+        self._start = {s["name"]: _start(s) for s in inputs if s["start"] is not None}
+        self._run = _RUNTIMES[form](folder / (name + FORMATS[form]), self.table)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        self.memory, self.values, self.seconds = dict(self._start), dict[str, Array](), 0.0
+
+    def __call__(self, values: dict[str, Array]) -> dict[str, Array]:
+        """One step, inputs by name -> outputs by name; what else ``values`` holds does not matter.
+
+        Inputs that come from the step before are in ``memory`` if not given.
+
+        Raises:
+            ExportError: an input that is neither given nor in ``memory``.
+        """
+        known = self.memory | values
+        try:
+            inputs = [known[name] for name in self._inputs]
+        except KeyError as error:
+            raise ExportError(f"{self._name}: nothing gives its input {error}") from error
+        started = time.thread_time()
+        outputs = self._run(inputs)
+        self.seconds = time.thread_time() - started
+        made = dict(zip(self._outputs, outputs, strict=True))
+        self.values = dict(zip(self._inputs, inputs, strict=True)) | made
+        self.memory = self.memory | {
+            name: self.values[source] for name, source in self._kept.items()
+        }
+        return made
+
+
+def _start(signal: Table) -> Array:
+    """What an input is in the first step."""
+    return np.broadcast_to(np.array(signal["start"], dtype=np.float64), signal["shape"]).copy()
+
+
+def _open_onnx(path: Path, table: Table) -> Run:
+    import onnxruntime  # type: ignore[import-untyped]
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    try:
+        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its classes have no common one of their own
+        raise ExportError(f"{path}: missing, or no ONNX graph") from error
+    for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
+        if [(s["name"], s["shape"]) for s in table[side]] != [(x.name, x.shape) for x in found]:
+            raise ExportError(f"{path}: its {side} are not those of its interface file")
+    names = [s["name"] for s in table["inputs"]]
+    return lambda values: session.run(None, dict(zip(names, values, strict=True)))
+
+
+def _open_torchscript(path: Path, table: Table) -> Run:
+    import torch as th
+
+    try:
+        with quiet():
+            module = th.jit.load(path)  # type: ignore[no-untyped-call]
+    except (RuntimeError, ValueError, OSError) as error:
+        raise ExportError(f"{path}: missing, or no TorchScript graph") from error
+
+    def run(values: list[Array]) -> list[Array]:
+        with th.inference_mode():
+            return [out.numpy() for out in module(*map(th.from_numpy, values))]
+
+    return run
+
+
+_RUNTIMES = {"onnx": _open_onnx, "torchscript": _open_torchscript}
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without what exporters and loaders say of themselves: deprecations, operators of
+    torchvision."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logging.disable(logging.WARNING)
+        try:
+            yield
+        finally:
+            logging.disable(logging.NOTSET)
+
+
+# ---------------------------------------------------------------------------------------------
+# Both graphs together
+
+
+class Controller:
+    """Both graphs of a folder, run in the order and with the memory that the interface says.
+
+    Args:
+        folder: that ``tdgc.export`` wrote.
+        form: of ``FORMATS``.
+
+    Raises:
+        ExportError: a folder that cannot be used.
+
+    Attributes:
+        low, high: the graphs; ``table`` of each is its interface file.
+        dt: s, a control step.
+        decimation: control steps per decision.
+        horizon: control steps of an episode.
+        bounds: of the continuous commands.
+        count: control steps since ``reset``.
+        commands: (15,) in force in the last step.
+        decided: whether ``high`` was run in the last step.
+        seconds: CPU time in the graphs in the last step.
+    """
+
+    def __init__(self, folder: Path, form: str = "onnx") -> None:
+        self._folder = folder
+        self._graphs = {name: Graph(folder, name, form) for name in GRAPHS}
+        self.low, self.high = self._graphs["low"], self._graphs["high"]
+        low, high = self.low.table, self.high.table
+        self._order = [(entry["graph"], entry["every"]) for entry in high["order"]]
+        self._task, self._probes = high["task"], high["probes"]
+        self._stand = np.array(self._task["stand"]["value"])
+        self._places = np.array(self._probes["ahead_left"]["value"])
+        self._level = np.array(low["frames"]["gravity_when_level"]["value"])
+        self._sources = {
+            name: [
+                (s["name"], *s["source"].split("."))
+                for s in graph.table["inputs"]
+                if s["source"] is not None
+            ]
+            for name, graph in self._graphs.items()
+        }
+        self.dt = 1.0 / low["rate"]["value"]
+        self.decimation = next(every for name, every in self._order if name == "high")
+        self.horizon = round(self._task["horizon"]["value"] / self.dt)
+        ranges = {c["name"]: (c["low"], c["high"]) for c in high["commands"] if "low" in c}
+        self.bounds = CommandRanges(**{name: ranges[name] for name in CONTINUOUS})
+        self.reset()
+
+    def reset(self, clock: float | None = None) -> None:
+        """Begin a new episode, with the gait clock at ``clock`` or where the interface says."""
+        for graph in self._graphs.values():
+            graph.reset()
+        if clock is not None:
+            for graph in self._graphs.values():
+                graph.memory["clock"] = np.array([clock])
+        self.count, self.commands, self.decided, self.seconds = 0, self._stand, False, 0.0
+        self._reached_at: int | None = None
+
+    def sense(
+        self,
+        state: RobotState,
+        goal: Array,
+        family: str,
+        ground: Callable[[Array, Array], Array],
+    ) -> dict[str, Array]:
+        """What the sensors and the map of a simulated robot say: inputs of the graphs by name, and
+        its heading ``yaw``, which logs may have.
+
+        Args:
+            state: of one robot.
+            goal: (2,) m in the world.
+            family: of the tile; one that has no name here is told as the interface says.
+            ground: heights in m of points (x, y) in the world; off its map, as at the nearest
+                border.
+        """
+        rotation, position, yaw = state.rotation[0], state.position[0], float(state.yaw[0])
+        ahead, left = np.cos(yaw), np.sin(yaw)
+        heading = np.array([[ahead, left], [-left, ahead]])  # world to the frame turned by yaw
+        points = position[:2] + self._places @ heading
+        plane = position[2] - self._probes["plane_below_trunk"]["value"]
+        families = self.high.table["families"]
+        told = family if family in families else self._task["family"]["otherwise"]
+        return {
+            "gravity": rotation.T @ self._level,
+            "joint_angles": state.q[0],
+            "joint_speeds": state.qd[0],
+            "gyro": rotation.T @ state.ang_vel[0],
+            "yaw": state.yaw.copy(),
+            "goal": heading @ (goal - position[:2]),
+            "family": np.eye(len(families))[families.index(told)],
+            "probes": ground(points[:, 0], points[:, 1]) - plane,
+        }
+
+    def step(self, readings: dict[str, Array]) -> Array:
+        """One control step: sensors and map by name, as from ``sense`` -> joint targets, (12,) rad.
+
+        After the goal and after the horizon it stands as the interface says.
+        """
+        task, elapsed, since = self._task, self.count * self.dt, 0.0
+        if np.linalg.norm(readings["goal"]) < task["goal_radius"]["value"]:
+            self._reached_at = self.count if self._reached_at is None else self._reached_at
+        if self._reached_at is not None:
+            since = (self.count - self._reached_at) * self.dt
+        over = self.count >= self.horizon or since >= task["after_goal"]["keep_deciding"]["value"]
+        readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
+        self.decided, self.seconds = False, 0.0
+        for name, every in self._order:
+            if self.count % every or (name == "high" and over):
+                continue
+            graph = self._graphs[name]
+            taken = {
+                mine: self._graphs[other].values[signal]
+                for mine, other, signal in self._sources[name]
+                if self._graphs[other].values  # it has run in this episode
+            }
+            if name == "low" and over:
+                taken["commands"] = self._stand
+            graph(readings | taken)
+            self.seconds += graph.seconds
+            self.decided |= name == "high"
+        self.commands = self.low.values["commands"]
+        self.count += 1
+        return self.low.values["joint_targets"]
+
+    # ------------------------------------------------------------------ the robot
+
+    def robot(self, urdf: Path | None = None) -> RobotConfig:
+        """The robot of the interface for this package's own simulation; its ``urdf`` is the copy in
+        the folder by default.
+
+        Raises:
+            ConfigError: a URDF that this package cannot read.
+            ExportError: a URDF of another robot, or joints that differ from leg to leg.
+        """
+        table = self.low.table
+        urdf = urdf or self._folder / table["robot"]["urdf"]["file"]
+        control, pose = table["joint_control"], table["start"]["joint_angles"]["value"]
+        hip, thigh, calf = pose[:3]
+        limits = [tuple(control[k]["value"][:3]) for k in ("torque_limit", "speed_limit")]
+        config = RobotConfig(
+            urdf=str(urdf),
+            kp=control["kp"]["value"][0],
+            kd=control["kd"]["value"][0],
+            torque_limit=limits[0],
+            speed_limit=limits[1],
+            nominal_hip=hip,
+            nominal_thigh=(thigh, pose[7]),
+            nominal_calf=calf,
+            base_height=table["robot"]["standing_height"]["value"],
+            joint_margin=control["target_margin"]["value"],
+        )
+        for what, told, taken in (
+            ("kp", control["kp"]["value"], [config.kp] * NUM_JOINTS),
+            ("kd", control["kd"]["value"], [config.kd] * NUM_JOINTS),
+            ("torque_limit", control["torque_limit"]["value"], config.torque_limit * 4),
+            ("speed_limit", control["speed_limit"]["value"], config.speed_limit * 4),
+            ("the start pose", pose, nominal_pose(config)),
+        ):
+            if not np.array_equal(told, taken):
+                raise ExportError(f"{what} differs from leg to leg: {told}, not {list(taken)}")
+        self._compare(config, urdf)
+        return config
+
+    def _compare(self, config: RobotConfig, urdf: Path) -> None:
+        """See that a URDF is of the robot that was exported."""
+        geometry, table = read_geometry(config), self.low.table
+        limits = table["joint_control"]["joint_limits"]
+        told = np.column_stack([limits["low"], limits["high"]])
+        wrong = f"{urdf}: not the exported robot's URDF, {table['robot']['urdf']['file']}"
+        for joint, mine, wanted in zip(JOINTS, geometry.joint_limits, told, strict=True):
+            if not np.array_equal(mine, wanted):
+                ends = [f"from {low:g} to {high:g} rad" for low, high in (mine, wanted)]
+                raise ExportError(f"{wrong}: {joint} turns {ends[0]}, that robot's {ends[1]}")
+        masses = table["robot"]["link_masses"]["value"]
+        for link in (*masses, *geometry.masses):
+            mine, wanted = geometry.masses.get(link, 0.0), masses.get(link, 0.0)
+            if mine != wanted:
+                raise ExportError(f"{wrong}: link {link} has {mine:g} kg, that robot's {wanted:g}")
+        height, wanted = nominal_height(config, geometry), table["start"]["trunk_height"]["value"]
+        if not np.isclose(height, wanted, rtol=0.0, atol=1e-9):
+            raise ExportError(f"{wrong}: starts {height:g} m high, that robot {wanted:g}")
+        if checksum(urdf) != table["robot"]["urdf"]["sha256"]:
+            raise ExportError(f"{wrong}: joint limits and masses agree, its checksum does not")

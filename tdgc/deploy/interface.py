@@ -1,0 +1,81 @@
+"""Interface files: all that a program needs to know of an exported pair, in fields with units.
+
+``tdgc.export`` writes one for each graph; ``interface.schema.json`` describes every field.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import json
+import textwrap
+from pathlib import Path
+from typing import Any
+
+from tdgc.config import read_json
+from tdgc.errors import InputError, install_hint
+
+#: Of the interface files; any change of what they hold is a new one.
+VERSION = 2
+SCHEMA = Path(__file__).with_name("interface.schema.json")
+
+Table = dict[str, Any]
+
+
+class ExportError(InputError):
+    """An export that cannot be used; the message is one line."""
+
+
+def require(what: str, names: tuple[str, ...], extra: str) -> None:
+    """Refuse to do something without the packages of an optional extra that it needs.
+
+    Raises:
+        ExportError: names those that are missing and what to install.
+    """
+    missing = [name for name in names if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ExportError(f"{what} needs {', '.join(missing)}: {install_hint(extra)}")
+
+
+def interface_path(folder: Path, name: str) -> Path:
+    """Where the interface file of the graph ``name`` is."""
+    return folder / f"{name}_interface.json"
+
+
+def read_interface(folder: Path, name: str) -> Table:
+    """The interface file of the graph ``name`` in an exported folder.
+
+    Raises:
+        ExportError: of another version, or one that lacks a field or has a wrong one.
+        ConfigError: no such file, or no JSON.
+    """
+    from jsonschema.exceptions import best_match
+
+    path = interface_path(folder, name)
+    table = read_json(path)
+    version = table.get("version") if isinstance(table, dict) else None
+    if version != VERSION:
+        raise ExportError(
+            f"{path}: an interface of version {version}, this package reads {VERSION}; export the "
+            "policies again"
+        )
+    error = best_match(_validator(name).iter_errors(table))
+    if error is not None:
+        where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in error.absolute_path)
+        said = textwrap.shorten(error.message, 200, placeholder="...")
+        raise ExportError(f"{path}: {where.removeprefix('.') or 'the interface'}: {said}")
+    return dict(table)
+
+
+@functools.cache
+def _validator(name: str) -> Any:
+    from jsonschema import Draft202012Validator
+
+    definitions = json.loads(SCHEMA.read_text(encoding="utf-8"))["$defs"]
+    return Draft202012Validator({"$defs": definitions, "$ref": f"#/$defs/{name}"})
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,61 @@
+"""Why a deployed pair failed, from a log of its inputs and outputs.
+
+    python -m tdgc.diagnose run.npz --export runs/export --outcome fell
+
+Prints the diagnosis and writes the trace. What only a simulator knows is missing in both, and they
+say what it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from tdgc.benchmark import diagnosis, trace
+from tdgc.deploy import log
+from tdgc.deploy.controller import Controller
+from tdgc.deploy.interface import require
+from tdgc.sim.geometry import read_geometry
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("log", type=Path, help=".npz or .csv, see docs/mujoco.md")
+    parser.add_argument("--export", type=Path, required=True, help="folder that was on the robot")
+    parser.add_argument(
+        "--outcome", choices=log.ENDS, help="how the episode ended, where the log does not say"
+    )
+    parser.add_argument("--out", type=Path, default=Path("runs/diagnosis"), help="results folder")
+    args = parser.parse_args(arguments)
+    try:
+        require("a log's diagnosis", ("jsonschema", "onnxruntime"), "mujoco")
+        trace.check_installed()
+        controller = Controller(args.export)
+        geometry = read_geometry(controller.robot())
+        found = log.read(args.log, controller)
+        episode = log.trace(found, controller, args.outcome)
+        args.out.mkdir(parents=True, exist_ok=True)
+        path = trace.write(episode, args.out)
+        largest, first = log.replay(found, controller)
+    except (ValueError, OSError) as error:
+        print(f"tdgc.diagnose: {error}", file=sys.stderr)
+        return 2
+    print(f"{found.name}: {episode.outcome} after {episode['time'][-1]:.2f} s; trace in {path}")
+    if episode.outcome != "reached":
+        failure = diagnosis.diagnose(episode, float(geometry.hips[0, 0]))
+        diagnosis.write([failure], args.out / "diagnosis.csv")
+        print(f"{failure.layer}: {failure.cause}\n{failure.evidence}")
+    if first < float("inf"):
+        print(
+            f"tdgc.diagnose: joint targets are not what the graphs give, from {first:.2f} s on, by "
+            f"up to {largest:.3f} rad: a value was not handed on, or the graphs are other ones",
+            file=sys.stderr,
+        )
+        return 1
+    print(f"joint targets are what the graphs give, to {largest:.1e} rad")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,309 @@
+"""The benchmark in a second simulator: an exported pair on the same tiles, in MuJoCo.
+
+    python -m tdgc.mujoco --export runs/export --levels 6-10 --families all --episodes 20
+
+What drives the robot is read from the exported folder alone: ONNX graphs, interface files and URDF.
+Tiles, rules, tables and files are those of evaluate.py; physics is MuJoCo's, docs/mujoco.md has its
+settings. It needs the extra ``mujoco``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from tdgc.benchmark.evaluation import (
+    Batch,
+    Cell,
+    Episode,
+    EpisodeLog,
+    Watcher,
+    closed_loop,
+    plan,
+    spread,
+)
+from tdgc.benchmark.flags import choose, choose_levels
+from tdgc.benchmark.recording import Recorder, Recording
+from tdgc.benchmark.results import describe, write_results
+from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
+from tdgc.deploy.controller import Controller
+from tdgc.deploy.interface import require
+from tdgc.deploy.log import LogWriter
+from tdgc.parallel.cores import usable_cores, workers_flag
+from tdgc.show import film
+from tdgc.sim.commands import INDEX
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array
+from tdgc.sim.sensors import Noise
+from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, height_map, is_map
+from tdgc.sim.world import WindowError
+
+if TYPE_CHECKING:
+    from tdgc.sim.mujoco_world import MujocoConfig
+
+POLICY = "tdgc-mujoco"  # in the results, beside PyBullet's "tdgc"
+_PACKAGES = ("jsonschema", "mujoco", "onnxruntime")  # the extra `mujoco` of setup.cfg
+
+
+class Deployed:
+    """An exported pair in the closed loop with one simulated robot: driver and executor at once.
+
+    Args:
+        controller: of the exported folder.
+        log: that its steps are written to.
+    """
+
+    def __init__(self, controller: Controller, log: LogWriter | None = None) -> None:
+        self.controller, self.log = controller, log
+        self.config = HighLevelConfig(decimation=controller.decimation, commands=controller.bounds)
+        self.bounds = controller.bounds
+        self.action: NDArray[np.floating] | None = None
+        self.told: str | None = None
+        self.probes: Array | None = None
+
+    def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
+        self._loco, self._goal, self._family = loco, goal[0], family
+        table = self.controller.high.table
+        if any(signal["name"] == "family" for signal in table["inputs"]):
+            self.told = table["families"][int(self.readings()["family"].argmax())]
+        self.controller.reset(float(loco.clock.clock[0]))
+
+    def readings(self) -> dict[str, Array]:
+        """What the robot's sensors and map say now."""
+        world = self._loco.world
+        return self.controller.sense(world.state, self._goal, self._family, world.ground_height)
+
+    def command(self, step: int) -> Array:
+        readings = self.readings()
+        self._targets = self.controller.step(readings)
+        if self.log is not None:
+            self.log.add(readings)
+        decided = self.controller.high.values
+        self.action = decided["decision"][None]
+        if "probes" in decided:
+            self.probes = decided["probes"][None]
+        return self.controller.commands[None]
+
+    def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
+        """Carry out the joint targets of the step that ``command`` ran."""
+        loco, low = self._loco, self.controller.low.values
+        loco.command[:], loco.carried_out = commands, commands.copy()
+        went = np.mod(low["next_clock"] - low["clock"], 1.0)
+        loco.carried_out[:, INDEX["frequency"]] = went / self.controller.dt
+        loco.targets = np.concatenate([self._targets[None, None], loco.targets[:-1]])
+        loco.world.step(loco.targets, loco.delay, loco.joint_offset)
+        loco.clock.clock[:] = low["next_clock"]
+        loco.clock.update(commands[:, 12:], commands[:, INDEX["duration"]])
+
+
+@functools.lru_cache(maxsize=1)
+def load(export: Path) -> Controller:
+    """The pair in an exported folder, once per process."""
+    return Controller(export)
+
+
+def run_episode(
+    cell: Cell,
+    pair: Deployed,
+    config: MujocoConfig,
+    seed: int,
+    watcher: Watcher,
+    visual: bool = False,
+) -> Episode:
+    """Run the only episode of ``cell``.
+
+    Args:
+        cell: which one.
+        pair: what drives the robot.
+        config: MuJoCo's settings.
+        seed: of the evaluation's tiles.
+        watcher: who looks on.
+        visual: keep what only a window shows.
+
+    Raises:
+        ValueError: a robot or settings that cannot be used.
+    """
+    from tdgc.sim.mujoco_world import MujocoWorld
+
+    controller, rate = pair.controller, pair.controller.low.table["joint_control"]["rate"]
+    robot, physics = controller.robot(), config.physics(controller.dt, rate["value"])
+    low = LowLevelConfig(robot=robot, physics=physics)
+    batch = Batch(
+        cell, low, seed, make_world=lambda f: MujocoWorld(robot, physics, f, config, visual)
+    )
+    episode = EpisodeLog(batch)
+    pair.begin(batch.loco, batch.goal, batch.told)
+    watcher.begin(cell, batch.loco, batch.field, batch.goal)
+    closed_loop(pair, pair, batch, episode, watcher)
+    if pair.log is not None:
+        pair.log.end(pair.readings())
+    return episode.episodes()[0]
+
+
+def run_cell(
+    cell: Cell, export: Path, config: MujocoConfig, seed: int, filmed: int, logs: Path, logged: int
+) -> tuple[list[Episode], list[Recording]]:
+    """Run the episodes of a cell one after another; recordings of the first ``filmed``, and logs
+    of the first ``logged`` written into ``logs``."""
+    controller, episodes, recordings = load(export), [], list[Recording]()
+    for number in range(cell.first, cell.first + cell.count):
+        one = Cell(cell.policy, cell.condition, cell.family, cell.level, number, 1)
+        pair = Deployed(controller, LogWriter(controller) if number < logged else None)
+        recorder = Recorder(pair, seed, filmed)
+        episode = run_episode(one, pair, config, seed, recorder)
+        episodes.append(episode)
+        recordings += recorder.recordings()
+        if pair.log is not None:
+            pair.log.save(logs / f"{episode.name}.npz")
+    return episodes, recordings
+
+
+def run_table(args: argparse.Namespace, config: MujocoConfig) -> list[str]:
+    """Run all cells and write everything; what is missing, a line each."""
+    for old in (*args.out.glob("logs/*.npz"), *args.out.glob("films/*")):
+        old.unlink()
+    if args.log:
+        (args.out / "logs").mkdir(exist_ok=True)
+    if args.video:
+        (args.out / "films").mkdir(exist_ok=True)
+    cells = plan([POLICY], ["nominal"], args.families, args.levels, args.episodes)
+    work = functools.partial(
+        run_cell,
+        export=args.export,
+        config=config,
+        seed=args.seed,
+        filmed=args.video,
+        logs=args.out / "logs",
+        logged=args.log,
+    )
+    episodes: list[Episode] = []
+    recordings: list[Recording] = []
+    with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
+        for ran, recorded in spread(work, cells, args.workers):
+            episodes += ran
+            recordings += recorded
+            bar.update(len(ran))
+    print(describe(write_results(args.out, episodes)))
+    settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
+    (args.out / "settings.json").write_text(json.dumps(settings, indent=2), encoding="utf-8")
+    print(f"\ntables are in {args.out}")
+    return film.produce(recordings, args.out / "films", args.workers) if recordings else []
+
+
+def show(args: argparse.Namespace, config: MujocoConfig) -> None:
+    """Show the first episode of the first family and level in MuJoCo's viewer.
+
+    Raises:
+        WindowError: no display, or the window was closed.
+    """
+    from tdgc.sim.mujoco_world import Window
+
+    cell = Cell(POLICY, "nominal", args.families[0], args.levels[0], 0, 1)
+    with Window() as window:
+        pair = Deployed(load(args.export))
+        episode = run_episode(cell, pair, config, args.seed, window, visual=True)
+    print(f"{episode.outcome.replace('_', ' ')}, {episode.time_s:.1f} s")
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--export", type=Path, required=True, help="folder of tdgc.export")
+    parser.add_argument("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
+    parser.add_argument(
+        "--families",
+        default="all",
+        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING}",
+    )
+    parser.add_argument("--episodes", type=int, default=100, help="per cell (100)")
+    parser.add_argument(
+        "--armature", type=float, metavar="KG_M2", help="rotor inertia of each joint (0.01 kg m^2)"
+    )
+    parser.add_argument(
+        "--joint-friction", type=float, metavar="NM", help="dry friction of each joint (0 N m)"
+    )
+    parser.add_argument(
+        "--set",
+        dest="assignments",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="change MuJoCo's settings, e.g. solref=0.02; may be repeated",
+    )
+    for flag, what in (("--video", "films, sheets and strips"), ("--log", "logs")):
+        text = f"{what} of the first N episodes per cell (1)"
+        parser.add_argument(flag, type=int, nargs="?", const=1, default=0, metavar="N", help=text)
+    parser.add_argument(
+        "--gui",
+        action="store_true",
+        help="MuJoCo's viewer instead of a table, on the first tile of the first family and level",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
+    parser.add_argument(
+        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
+    )
+    parser.add_argument("--out", type=Path, default=Path("runs/mujoco"), help="results folder")
+    return parser.parse_args(arguments)
+
+
+def check(args: argparse.Namespace) -> MujocoConfig:
+    """Read what the flags ask for; MuJoCo's settings.
+
+    Raises:
+        ValueError: flags or an exported folder that cannot be used.
+    """
+    require("MuJoCo's benchmark", _PACKAGES, "mujoco")
+    from tdgc.sim.mujoco_world import MujocoConfig
+
+    args.levels = choose_levels(args.levels)
+    maps = tuple(filter(is_map, args.families.split(",")))
+    args.families = choose(args.families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
+    for name in maps:
+        height_map(name)
+    args.workers = usable_cores() if args.workers == "auto" else args.workers
+    for flag, value in (("--episodes", args.episodes), ("--workers", args.workers)):
+        if value < 1:
+            raise ValueError(f"{flag} must be at least 1, not {value}")
+    for flag, value in (("--video", args.video), ("--log", args.log)):
+        if not 0 <= value <= args.episodes:
+            raise ValueError(f"{flag} must lie in [0, --episodes], not {value}")
+        if args.gui and value:
+            raise ValueError(f"--gui is only to be looked at: no {flag}")
+    if not 0 <= args.seed < 2**32:
+        raise ValueError(f"--seed must lie in [0, 2**32), not {args.seed}")
+    config = with_overrides(MujocoConfig(), args.assignments)
+    for key in ("armature", "joint_friction"):
+        if getattr(args, key) is not None:
+            config = with_overrides(config, [f"{key}={getattr(args, key)}"])
+    controller = load(args.export)
+    controller.robot()
+    config.physics(controller.dt, controller.low.table["joint_control"]["rate"]["value"])
+    return config
+
+
+def main(arguments: list[str] | None = None) -> int:
+    args = parse(arguments)
+    try:
+        config = check(args)
+        if args.gui:
+            show(args, config)
+            return 0
+        args.out.mkdir(parents=True, exist_ok=True)
+        problems = run_table(args, config)
+    except (ValueError, OSError, WindowError) as error:
+        print(f"tdgc.mujoco: {error}", file=sys.stderr)
+        return 2
+    for problem in problems:
+        print(f"tdgc.mujoco: {problem}", file=sys.stderr)
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

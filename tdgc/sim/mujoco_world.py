@@ -1,0 +1,292 @@
+"""A robot on its tile in MuJoCo: the only module that imports mujoco.
+
+Robot, ground and joint control are those of the Bullet world: the same URDF, the same surface and
+the same PD law. Contacts, integration and the motors' rotors are MuJoCo's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
+from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.robot import Array, RobotState, pd_torque, rotation_matrix
+from tdgc.sim.terrain import TileField
+from tdgc.sim.world import GRAVITY, WindowError, World, check_display
+
+_CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
+_NAME = "ground"
+_BASE = 0.5  # m of ground under its lowest point: MuJoCo's height fields are solid
+# Parts that a geom belongs to: the ground, the trunk, a foot, a leg above it (plus 0-3 each).
+_GROUND, _TRUNK, _FOOT, _LEG = -1, 0, 1, 5
+
+
+@dataclass(frozen=True)
+class MujocoConfig:
+    """MuJoCo's settings; docs/mujoco.md has what each costs."""
+
+    timestep: float = 0.0025  # s, Bullet's on terrain
+    # s, time constant of contacts and joint limits. At MuJoCo's default of 0.02 s feet get 3-4 cm
+    # into the ground, past their centres, and stay there.
+    solref: float = 0.005
+    # With friction pyramids and MuJoCo's impratio of 1 feet creep down slopes.
+    cone: Literal["elliptic", "pyramidal"] = "elliptic"
+    impratio: float = 100.0
+    friction: float = 0.8  # foot on ground, nominal (benchmark)
+    armature: float = 0.01  # kg m^2, rotor of each joint's motor: as in models of such robots
+    joint_friction: float = 0.0  # N m in each joint, dry
+
+    def physics(self, control_dt: float, joint_rate: float) -> PhysicsConfig:
+        """The steps of control, joint control and physics.
+
+        Args:
+            control_dt: s, a control step.
+            joint_rate: Hz at which joint torques are computed.
+
+        Raises:
+            ConfigError: ``timestep`` does not divide the joint control's step.
+        """
+        joint_dt = 1.0 / joint_rate
+        substeps, hold = round(control_dt / self.timestep), round(joint_dt / self.timestep)
+        steps = np.array([substeps, hold]) * self.timestep
+        if not np.allclose(steps, [control_dt, joint_dt]):
+            raise ConfigError(
+                f"'timestep' must divide the joint control's step, {joint_dt:g} s, not "
+                f"{self.timestep:g}"
+            )
+        return PhysicsConfig(control_dt, substeps, hold, friction=self.friction)
+
+
+class MujocoWorld(World):
+    """One robot on the only tile of a field, simulated by MuJoCo instead of Bullet.
+
+    It does what an episode asks of a ``World``. What training asks beyond that it cannot do: other
+    terrain, forgetting, pictures.
+
+    Args:
+        robot: its URDF, gains and limits.
+        physics: from ``config``.
+        field: (1, 1) tiles.
+        config: MuJoCo's settings.
+        visual: keep what only a window shows.
+
+    Raises:
+        ConfigError: a URDF that MuJoCo cannot load.
+    """
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        physics: PhysicsConfig,
+        field: TileField,
+        config: MujocoConfig,
+        visual: bool = False,
+    ) -> None:
+        self.num_robots, self.robot, self.physics, self.field = 1, robot, physics, field
+        self.strength, self._active = np.ones((1, 1)), np.arange(1)
+        self.state = RobotState.zeros(read_geometry(robot), 1)
+        self.model = _build(robot, field, config, visual)
+        self.data = mujoco.MjData(self.model)
+        joints = [self.model.joint(name) for name in JOINTS]
+        self._q = np.array([joint.qposadr[0] for joint in joints])
+        self._qd = np.array([joint.dofadr[0] for joint in joints])
+        self._part = self._parts()
+        trunk = self.model.body(1)
+        self._trunk = trunk.mass.copy(), trunk.inertia.copy()
+        self._armature = config.armature
+
+    def _parts(self) -> NDArray[np.int64]:
+        """What each geom is part of, as codes of this module."""
+        model = self.model
+        carrier = model.body_weldid[model.geom_bodyid]  # what is fixed to a link belongs to it
+        parts = np.where(model.geom_bodyid == 0, _GROUND, _TRUNK)
+        for k, name in enumerate(JOINTS):
+            parts[carrier == model.joint(name).bodyid[0]] = _LEG + k // 3
+        mujoco.mj_kinematics(model, self.data)
+        feet = self.state.foot_body[0]  # at joint angles 0 and the trunk at the origin, as there
+        for leg in range(4):
+            mine = np.flatnonzero((parts == _LEG + leg) & (model.geom_contype > 0))
+            away = np.linalg.norm(self.data.geom_xpos[mine] - feet[leg], axis=1)
+            parts[mine[away.argmin()]] = _FOOT + leg
+        return parts
+
+    def _put(self, i: int) -> None:
+        """Bring the robot of MuJoCo to where ``state`` has it."""
+        state, data = self.state, self.data
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:3], data.qpos[3:7] = state.position[i], np.roll(state.quaternion[i], 1)
+        data.qpos[self._q], data.qvel[self._qd] = state.q[i], state.qd[i]
+        self._move_trunk(i)
+
+    def _move_trunk(self, i: int) -> None:
+        """Let the trunk move as ``state`` has it."""
+        state, velocity = self.state, self.data.qvel
+        turn = rotation_matrix(state.quaternion)[i].T
+        velocity[:3], velocity[3:6] = state.lin_vel[i], turn @ state.ang_vel[i]
+
+    def set_dynamics(
+        self, index: ArrayLike, friction: Array, payload: Array, armature: Array
+    ) -> None:
+        """As ``World.set_dynamics``; ``armature`` (1,) kg m^2 comes on top of the settings'."""
+        model, (mass, inertia) = self.model, self._trunk
+        share = (mass + payload) / mass  # spread over the trunk, the payload scales its inertia
+        model.body(1).mass, model.body(1).inertia = share * mass, share * inertia
+        model.geom_friction[:, 0] = friction[0]  # of two in contact MuJoCo takes the larger
+        model.dof_armature[self._qd] = self._armature + armature
+        mujoco.mj_setConst(model, mujoco.MjData(model))  # it leaves the robot elsewhere
+
+    def retire(self, index: ArrayLike) -> None:
+        """The robot's episode has ended, and this world has no other robot."""
+
+    def step(self, targets: Array, delay: Array, offset: Array) -> None:
+        """One control step of PD control, as ``World.step``."""
+        model, data, state = self.model, self.data, self.state
+        state.trunk_force = np.zeros(1)
+        for target in self._wanted(targets, delay, offset):
+            error, speed = target - data.qpos[self._q], data.qvel[self._qd]
+            state.torque = pd_torque(error, speed[None], self.strength, self.robot)
+            data.qfrc_applied[self._qd] = state.torque[0]
+            for _ in range(self.physics.hold):
+                mujoco.mj_step(model, data)
+                force = self._contact_force()
+                state.trunk_force[0] = max(force[_TRUNK], state.trunk_force[0])
+        state.foot_force[0], state.leg_force[0] = force[_FOOT:_LEG], force[_LEG:]
+        state.position[0], state.quaternion[0] = data.qpos[:3], np.roll(data.qpos[3:7], -1)
+        state.q[0], state.qd[0] = data.qpos[self._q], data.qvel[self._qd]
+        state.lin_vel[0] = data.qvel[:3]
+        state.ang_vel[0] = rotation_matrix(state.quaternion)[0] @ data.qvel[3:6]
+        state.derive()
+
+    def _contact_force(self) -> Array:
+        """Normal force of the last physics step on the trunk, the feet and the legs, (9,) N."""
+        force, wrench = np.zeros(_LEG + 4), np.zeros(6)
+        parts = self._part[self.data.contact.geom].max(axis=1)  # the robot's, not the ground's
+        for k, part in enumerate(parts):
+            mujoco.mj_contactForce(self.model, self.data, k, wrench)
+            force[part] += wrench[0]
+        return force
+
+    def close(self) -> None:
+        """Nothing of MuJoCo needs to be closed."""
+
+
+def _build(
+    robot: RobotConfig, field: TileField, config: MujocoConfig, visual: bool
+) -> mujoco.MjModel:
+    """The robot above its ground."""
+    path = urdf_path(robot)
+    try:
+        spec = _with_visuals(path) if visual else mujoco.MjSpec.from_file(str(path))
+        spec.compiler.fusestatic = False  # it would weld the trunk to the world
+        spec.worldbody.first_body().add_freejoint()
+        _add_ground(spec, field)
+        _set(spec, config)
+        return spec.compile()
+    except ValueError as error:  # a mesh that is not there, an element it cannot read
+        raise ConfigError(f"{path}: MuJoCo cannot load it: {error}") from error
+
+
+def _with_visuals(urdf: Path) -> mujoco.MjSpec:
+    """The robot with its visual shapes, which MuJoCo would leave out; but for those of meshes."""
+    tree = ElementTree.fromstring(urdf.read_text(encoding="utf-8"))
+    for link in tree.iter("link"):
+        for shape in link.findall("visual"):
+            if shape.find("geometry/mesh") is not None:
+                link.remove(shape)
+    compiler = ElementTree.SubElement(ElementTree.SubElement(tree, "mujoco"), "compiler")
+    compiler.set("discardvisual", "false")
+    return mujoco.MjSpec.from_string(ElementTree.tostring(tree, encoding="unicode"))
+
+
+def _add_ground(spec: mujoco.MjSpec, field: TileField) -> None:
+    """The field's surface. MuJoCo splits a cell along the other diagonal than Bullet, up to 5 mm
+    apart on rough ground, so the field is turned by a quarter: its columns are along y, and its
+    rows against x."""
+    half_x, half_y = 0.5 * field.cell * (np.array(field.heights.shape) - 1)
+    low, high = float(field.heights.min()), float(field.heights.max())
+    spec.add_hfield(
+        name=_NAME,
+        size=[half_y, half_x, high - low or _BASE, _BASE],  # a plane has no heights to scale
+        nrow=field.heights.shape[0],
+        ncol=field.heights.shape[1],
+        userdata=field.heights[::-1].ravel().astype(np.float64),
+    )
+    spec.worldbody.add_geom(
+        name=_NAME,
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname=_NAME,
+        pos=[half_x, half_y, low],
+        quat=[0.5**0.5, 0.0, 0.0, 0.5**0.5],
+        contype=0,
+        conaffinity=1,
+        rgba=[0.87, 0.84, 0.77, 1.0],
+    )
+
+
+def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
+    """Bring the settings into the model."""
+    option = spec.option
+    option.timestep, option.gravity = config.timestep, [0.0, 0.0, -GRAVITY]
+    option.cone, option.impratio = _CONES[config.cone], config.impratio
+    spec.visual.headlight.ambient = [0.5, 0.5, 0.5]  # the window's only light
+    for geom in spec.geoms:
+        geom.solref, geom.condim = [config.solref, 1.0], 3
+        geom.friction[0] = config.friction  # of two in contact MuJoCo takes the larger
+        if geom.name != _NAME:  # a robot meets the ground and not itself, as in Bullet
+            geom.conaffinity = 0
+    for joint in spec.joints:
+        if joint.name not in JOINTS:
+            continue
+        # All that moves a joint beside its torque is told here, whatever the URDF says.
+        joint.armature, joint.frictionloss = config.armature, config.joint_friction
+        joint.damping = [0.0, 0.0, 0.0]
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        joint.solref_limit = [config.solref, 1.0]
+
+
+class Window:
+    """A ``Watcher`` that shows an episode in MuJoCo's viewer, as fast as it happens.
+
+    Raises:
+        WindowError: no display, or the window was closed.
+    """
+
+    def __init__(self) -> None:
+        self._open = contextlib.ExitStack()
+
+    def __enter__(self) -> Window:
+        check_display()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.close()
+
+    def begin(self, cell: object, loco: Locomotion, field: TileField, goal: Array) -> None:
+        from mujoco import viewer
+
+        world = loco.world
+        assert isinstance(world, MujocoWorld)
+        self._dt, self._due = world.physics.control_dt, time.perf_counter()
+        opened = viewer.launch_passive(
+            world.model, world.data, show_left_ui=False, show_right_ui=False
+        )
+        self._shown = self._open.enter_context(opened)
+        self._shown.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        self._shown.cam.trackbodyid, self._shown.cam.distance = 1, 2.0
+
+    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+        if not self._shown.is_running():
+            raise WindowError("the window was closed")
+        self._shown.sync()
+        self._due += self._dt
+        time.sleep(max(0.0, self._due - time.perf_counter()))

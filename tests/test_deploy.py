@@ -1,0 +1,207 @@
+"""An exported folder says all that a program needs, and the controller does what it says."""
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+
+from tdgc import export
+from tdgc.deploy.controller import GRAPHS, Controller
+from tdgc.deploy.interface import SCHEMA, ExportError, read_interface
+from tdgc.sim.geometry import read_geometry
+from tdgc.sim.robot import RobotState
+from tdgc.tasks.high_env import PRETRAINED
+
+FORM = "torchscript"  # written in a tenth of the time
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped pair."""
+    path = tmp_path_factory.mktemp("export")
+    export.write(export.load_pair(PRETRAINED / "low", PRETRAINED / "high"), path, [FORM])
+    return path
+
+
+@pytest.fixture(scope="module")
+def controller(folder: Path) -> Controller:
+    return Controller(folder, FORM)
+
+
+def state(controller: Controller, **values: Any) -> RobotState:
+    """One robot at the origin, standing."""
+    made = RobotState.zeros(read_geometry(controller.robot()), 1)
+    made.position[0, 2] = 0.3
+    for name, value in values.items():
+        getattr(made, name)[0] = value
+    made.derive()
+    return made
+
+
+def level(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.zeros_like(x)
+
+
+# --- the files ----------------------------------------------------------------------------------
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where the fields of an interface are; what the policy's file says is for people."""
+    if path == ("policy",):
+        return
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield (*path, key)
+            yield from places(inner, (*path, key))
+    elif isinstance(value, list):
+        for k, inner in enumerate(value):
+            yield from places(inner, (*path, k))
+
+
+def test_the_schema_is_one_and_the_files_keep_to_it(folder: Path) -> None:
+    schema = json.loads(SCHEMA.read_text())
+    Draft202012Validator.check_schema(schema)
+    for name in GRAPHS:
+        table = json.loads((folder / f"{name}_interface.json").read_text())
+        assert list(Draft202012Validator(schema).iter_errors(table)) == []
+        assert read_interface(folder, name) == table
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_each_missing_field_is_refused_in_one_line(folder: Path, tmp_path: Path, name: str) -> None:
+    whole = json.loads((folder / f"{name}_interface.json").read_text())
+    masses = ("robot", "link_masses", "value")  # whose names are the robot's
+    fields = [path for path in places(whole) if path[:-1] != masses]
+    assert len(fields) > 150
+    schema = Draft202012Validator(json.loads(SCHEMA.read_text()))
+    for *above, last in fields:
+        table = copy.deepcopy(whole)
+        inner = table
+        for key in above:
+            inner = inner[key]
+        del inner[last]
+        (tmp_path / f"{name}_interface.json").write_text(json.dumps(table))
+        with pytest.raises(ExportError) as refused:
+            read_interface(tmp_path, name)
+        message = str(refused.value)
+        assert "\n" not in message and len(message) < 400
+        assert "version" in message if last == "version" else str(last) in message, message
+        assert not schema.is_valid(table)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 1}, "an interface of version 1, this package reads 2; export the policies"),
+        ({"version": None}, "an interface of version None"),
+        ({"rate": {"unit": "ms", "value": 50}}, "rate.unit: 'Hz' was expected"),
+        ({"rate": {"unit": "Hz", "value": 0}}, "rate.value: 0 is less than or equal to"),
+        ({"joints": ["a"]}, "joints: "),
+        ({"colour": "red"}, "'colour' was unexpected"),
+    ],
+)
+def test_other_interfaces_are_refused(
+    folder: Path, tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    table = json.loads((folder / "low_interface.json").read_text()) | change
+    (tmp_path / "low_interface.json").write_text(json.dumps(table))
+    with pytest.raises(ExportError) as refused:
+        read_interface(tmp_path, "low")
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('lower="-2.82"', 'lower="-2.7"', "FL_calf_joint turns from -2.7 to -0.89 rad, that robot"),
+        ('<mass value="5.6"/>', '<mass value="6"/>', "link trunk has 6 kg, that robot's 5.6"),
+        ("A1/Go1 class", "A1 class", "joint limits and masses agree, its checksum does not"),
+        ('xyz="0 0 -0.213"', 'xyz="0 0 -0.2"', "m high"),
+    ],
+)
+def test_another_robot_is_refused(
+    folder: Path, tmp_path: Path, controller: Controller, old: str, new: str, message: str
+) -> None:
+    urdf = tmp_path / "other.urdf"
+    urdf.write_text((folder / "quadruped.urdf").read_text().replace(old, new))
+    with pytest.raises(ExportError, match=f"not the exported robot's URDF.*{message}"):
+        controller.robot(urdf)
+
+
+def test_the_folder_brings_its_robot(folder: Path, controller: Controller) -> None:
+    robot = controller.robot()
+    assert Path(robot.urdf).parent == folder
+    assert sum(read_geometry(robot).masses.values()) == pytest.approx(12.6)
+
+
+# --- the controller -----------------------------------------------------------------------------
+
+
+def test_sensing_is_in_the_frames_that_the_interface_names(controller: Controller) -> None:
+    half = np.pi / 4.0
+    left = np.array([0.0, 0.0, np.sin(half), np.cos(half)])  # a quarter turn to the left
+    robot = state(controller, quaternion=left, ang_vel=[1.0, 0.0, 0.5], position=[2.0, 3.0, 0.35])
+    seen = controller.sense(robot, np.array([2.0, 7.0]), "stair", lambda x, y: 0.1 * x + y)
+    assert seen["gravity"] == pytest.approx([0.0, 0.0, -1.0])
+    assert seen["goal"] == pytest.approx([4.0, 0.0])  # ahead
+    assert seen["gyro"] == pytest.approx([0.0, -1.0, 0.5])
+    assert seen["family"].tolist() == [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    # The first probe is 0.25 m behind and 0.1 m to the left, so at (1.9, 2.75) in the world.
+    assert seen["probes"][0] == pytest.approx(0.19 + 2.75 - (0.35 - 0.3))
+    down = state(controller, quaternion=[0.0, np.sin(half / 2), 0.0, np.cos(half / 2)])
+    assert controller.sense(down, np.ones(2), "?", level)["gravity"][0] > 0.7  # nose down
+    assert controller.sense(down, np.ones(2), "?", level)["family"][-1] == 1.0
+
+
+def test_graphs_run_in_order_and_hand_their_values_on(controller: Controller) -> None:
+    robot, goal = state(controller), np.array([6.0, 0.0])
+    controller.reset(0.3)
+    decided, clocks = [], []
+    for step in range(11):
+        targets = controller.step(controller.sense(robot, goal, "rough", level))
+        decided.append(controller.decided)
+        clocks.append(controller.low.values["clock"][0])
+        if controller.decided:
+            assert controller.high.values["clock"][0] == clocks[-1]
+            assert controller.high.values["time_left"][0] == pytest.approx(20.0 - 0.02 * step)
+        assert np.array_equal(controller.low.values["commands"], controller.high.values["commands"])
+        assert targets.shape == (12,)
+    assert decided == [step % 5 == 0 for step in range(11)]
+    assert clocks[0] == 0.3 and clocks[1] == pytest.approx(0.3 + 0.02 * 3.5, abs=0.02)
+    controller.reset()
+    controller.step(controller.sense(robot, goal, "rough", level))
+    assert controller.high.values["clock"][0] == 0.0
+
+
+def test_it_stands_after_the_goal_and_after_the_horizon(controller: Controller) -> None:
+    task = controller.high.table["task"]
+    stand = np.array(task["stand"]["value"])
+    assert stand[:3].tolist() == [0.0, 0.0, 0.0] and stand[12:].tolist() == [0.5, 0.0, 0.0]
+    robot = state(controller)
+    controller.reset()
+    at, away = (controller.sense(robot, np.array([x, 0.0]), "rough", level) for x in (0.4, 5.0))
+    for step in range(120):
+        controller.step(at if step == 15 else away)
+        standing = step >= 15 + 100  # 2 s, as it was trained to go on
+        assert controller.decided == (step % 5 == 0 and not standing)
+        assert np.array_equal(controller.commands, stand) == standing
+    controller.reset()
+    controller.step(away)
+    controller.count = controller.horizon - 1
+    controller.step(away)
+    assert not np.array_equal(controller.commands, stand)
+    controller.step(away)
+    assert np.array_equal(controller.commands, stand) and not controller.decided
+
+
+def test_a_graph_that_is_missing_is_refused(folder: Path, tmp_path: Path) -> None:
+    for path in folder.glob("*_interface.json"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    for form, suffix in (("torchscript", "pt"), ("onnx", "onnx")):
+        with pytest.raises(ExportError, match=rf"low\.{suffix}: missing, or no"):
+            Controller(tmp_path, form)
