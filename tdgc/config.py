@@ -56,6 +56,10 @@ class RobotConfig:
     base_height: float = 0.30  # m, standing (benchmark)
     # q0 follows the commanded behaviour (``robot.commanded_pose``); the paper's q0 is fixed.
     commanded_pose: bool = True
+    # q0 walks as well: it carries the robot's weight and its feet run along Raibert's footholds
+    # (``robot.walking_pose``). On legs this soft a pose without its load hangs 5 cm low, and its
+    # swing feet drag: at zero actions feet asked for 8 cm in trot do not leave the ground.
+    commanded_gait: bool = field(default=True, metadata={"before": False})
     # Gait cycles after a start or a change of gait over which q0's swing grows to what is asked:
     # of 21 falls in walking with random changes of gait 19 came within 0.7 s of one.
     swing_ramp: float = 1.0

@@ -53,6 +53,7 @@ from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import Term, width
 from tdgc.sim.robot import (
+    GRAVITY,
     HIGHEST_FOOT,
     NUM_JOINTS,
     Array,
@@ -171,10 +172,13 @@ def clock_signal(clock: Tensor, command: Tensor) -> Tensor:
 class Pose(nn.Module):
     """q0, as ``Locomotion.pose``: (1,), (1,), (15,) -> (12,) rad."""
 
-    def __init__(self, robot: RobotConfig) -> None:
+    def __init__(self, robot: RobotConfig, control_dt: float) -> None:
         super().__init__()
         nominal = nominal_pose(robot)
         self.follows, self.nominal = robot.commanded_pose, _constant(nominal)
+        self.walks, self.kp = robot.commanded_gait, _constant(robot.kp)
+        self.middle = _constant(0.5 * control_dt)
+        self.ahead = _constant(0.5 * control_dt + robot.kd / robot.kp)
         geometry = read_geometry(robot)
         self.thigh, self.calf = geometry.thigh, geometry.calf
         standing, _ = foot_kinematics(geometry, nominal[None], np.zeros((1, NUM_JOINTS)))
@@ -183,18 +187,60 @@ class Pose(nn.Module):
         self.front, self.side = _constant(FRONT), _constant(SIDE)
         self.out = _constant(geometry.abduction * SIDE)
         self.lowest, self.highest = map(_constant, geometry.joint_limits[2::3].T)
+        self.hips = _constant(geometry.hips)
+        self.weight = _constant(GRAVITY * sum(geometry.masses.values()))
 
     def forward(self, clock: Tensor, grown: Tensor, command: Tensor) -> Tensor:
         """``grown``: share of the swing that is asked so far, as in ``PhaseClock.swing``."""
         if not self.follows:
             return self.nominal
+        if self.walks:
+            return self._walk(clock, grown, command)
         swing = (2.0 * foot_phases(clock, command) - 1.0).clamp(0.0, 1.0)
         raised = grown * th.sin(0.5 * _TURN * swing)
         change = command - self.default
         x = self.feet[:, 0] + 0.5 * change[INDEX["stance_length"]] * self.front
         y = self.feet[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
         z = self.feet[:, 2] - change[INDEX["body_height"]]
-        z = (z + change[INDEX["swing_height"]] * raised).clamp(max=HIGHEST_FOOT)
+        return self._angles(x, y, z + change[INDEX["swing_height"]] * raised).flatten()
+
+    def _walk(self, clock: Tensor, grown: Tensor, command: Tensor) -> Tensor:
+        """As ``robot.walking_pose``."""
+        change, frequency = command - self.default, command[INDEX["frequency"]]
+        now = foot_phases(clock + self.middle * frequency, command)
+        phases = foot_phases(clock + self.ahead * frequency, command)
+        swing = (2.0 * phases - 1.0).clamp(0.0, 1.0)
+        raised = grown * command[INDEX["swing_height"]] * th.sin(0.5 * _TURN * swing)
+        # From here on against the hips, but for what turns about the trunk.
+        x = self.feet[:, 0] + self.hips[:, 0] + 0.5 * change[INDEX["stance_length"]] * self.front
+        y = self.feet[:, 1] + self.hips[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
+        z = self.feet[:, 2] - change[INDEX["body_height"]] + raised
+        turn, duty = command[INDEX["yaw_rate"]], command[INDEX["duration"]]
+        lead = grown * ((1.0 - 2.0 * phases).abs() - 0.5) * duty / frequency
+        x, y = (
+            x + lead * (command[INDEX["vx"]] - turn * y),
+            y + lead * (command[INDEX["vy"]] + turn * x),
+        )
+        pitch, roll = command[INDEX["pitch"]], command[INDEX["roll"]]
+        x, z = th.cos(pitch) * x - th.sin(pitch) * z, th.sin(pitch) * x + th.cos(pitch) * z
+        y, z = th.cos(roll) * y + th.sin(roll) * z, th.cos(roll) * z - th.sin(roll) * y
+        q = self._angles(x - self.hips[:, 0], y - self.hips[:, 1], z)
+        peak = 0.125 * 0.5 * _TURN * self.weight / duty
+        load = peak * th.sin(_TURN * now).clamp(min=0.0)
+        return (q - load[:, None] * self._rises(q) / self.kp).flatten()
+
+    def _rises(self, q: Tensor) -> Tensor:
+        """How much feet rise per rad of each joint, as in ``robot.load_torque``: (4, 3) m/rad."""
+        hip, thigh, calf = q.unbind(1)
+        x_thigh, x_calf = self.thigh * th.sin(thigh), self.calf * th.sin(thigh + calf)
+        down = -self.thigh * th.cos(thigh) - self.calf * th.cos(thigh + calf)
+        y = self.out * th.cos(hip) - down * th.sin(hip)
+        return th.stack([y, (x_thigh + x_calf) * th.cos(hip), x_calf * th.cos(hip)], 1)
+
+    def _angles(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """Joint angles of feet at (4,) m each against their hips, as ``robot.leg_angles``: (4, 3)
+        rad."""
+        z = z.clamp(max=HIGHEST_FOOT)
         out, upper, lower = self.out, self.thigh, self.calf
         down = (y * y + z * z - out * out).clamp(min=0.0).sqrt()
         square = x * x + down * down
@@ -205,7 +251,7 @@ class Pose(nn.Module):
         lean = lower * th.sin(calf) / (upper + lower * th.cos(calf))
         hip = th.atan(((out * z + down * y) / (out * y - down * z)).float()).double()
         thigh = (th.atan((-x / down).float()) - th.atan(lean.float())).double()
-        return th.stack([hip, thigh, calf], 1).flatten()
+        return th.stack([hip, thigh, calf], 1)
 
 
 class LowLevel(nn.Module):
@@ -221,7 +267,7 @@ class LowLevel(nn.Module):
         robot = config.robot
         self.dt = _constant(config.physics.control_dt)
         self.limit = _constant(robot.action_limit)
-        self.pose = Pose(robot)
+        self.pose = Pose(robot, config.physics.control_dt)
         self.row = Row(actor_layout(config.gyro))
         self.whole = _constant(1.0)
         ramped = robot.commanded_pose and robot.swing_ramp > 0.0

@@ -167,16 +167,19 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("gyro", "symmetric", "start"), [(False, True, 3.5), (True, False, 3.5), (True, False, 0.0)]
-)
+    ("gyro", "symmetric", "walks", "start"),
+    [(False, True, True, 3.5), (False, True, False, 3.5), (True, False, False, 3.5),
+     (True, False, False, 0.0)],
+)  # fmt: skip
 def test_low_level_is_the_executors_step(
-    tmp_path: Path, gyro: bool, symmetric: bool, start: float
+    tmp_path: Path, gyro: bool, symmetric: bool, walks: bool, start: float
 ) -> None:
     robot = RobotConfig(
         action_limit=0.6,
         hip_scale=0.4,
         nominal_hip=0.07,
         commanded_pose=symmetric,
+        commanded_gait=walks,
         start_frequency=start,
     )
     config = LowLevelConfig(gyro=gyro, robot=robot)

@@ -18,7 +18,8 @@ from test_structure import DOORS, FLOOR
 import evaluate
 import train_high
 import train_low
-from tdgc import bench, calibration, export, policies
+from tdgc import bench, calibration, diagnose, export, mujoco, policies
+from tdgc.ablate import __main__ as ablate
 from tdgc.benchmark.evaluation import CONDITIONS
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
@@ -35,6 +36,9 @@ MAINS = {
     "tdgc.bench": bench.main,
     "tdgc.calibration": calibration.main,
     "tdgc.export": export.main,
+    "tdgc.diagnose": diagnose.main,
+    "tdgc.mujoco": mujoco.main,
+    "tdgc.ablate": ablate.main,
 }
 
 
@@ -153,6 +157,11 @@ READ = (
     "python train_high.py --preset paper --out runs/paper",
     "python -m tdgc.calibration --low runs/low/policy --out runs/calibrated",
     "OMP_NUM_THREADS=1 python train_low.py --workers 1",
+    "python -m tdgc.ablate --out runs/ablation",
+    "python -m tdgc.diagnose run.npz --export runs/export --outcome fell",
+    "python -m tdgc.export --out runs/export",
+    "python -m tdgc.mujoco --export runs/export --levels 6-10 --families all --episodes 20",
+    "python train_high.py --no-teacher --low runs/low/policy --out runs/alone",
     "python -m tdgc.bench --load",
     "python -m tdgc.bench --update",
     "python -m tdgc.bench --cluster auto",
@@ -168,6 +177,7 @@ RAY = (
 BY_CI = (
     "python3 -m venv .venv",
     ".venv/bin/pip install -c constraints.txt -e '.[video]'",
+    "pip install -c constraints.txt -e '.[export,mujoco]'",
     ".venv/bin/pip install -c constraints.txt -e '.[dev]'",
     ".venv/bin/python -m pytest -n 2",
     ".venv/bin/python -m pytest tests/test_rewards.py",
@@ -357,7 +367,7 @@ def test_flags_are_the_scripts(
 
 def test_both_trainers_take_the_same_flags(capsys: pytest.CaptureFixture[str]) -> None:
     both, low = flags(train_high.main, capsys), flags(train_low.main, capsys)
-    assert both == [*low, "--low", "--preset"]
+    assert both == [*low, "--low", "--preset", "--no-teacher"]
 
 
 def flags(main: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str]) -> list[str]:

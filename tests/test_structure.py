@@ -22,18 +22,15 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     ("tdgc", "errors", "state"),
     ("config",),
-    ("policies", "sim"),
-    ("parallel",),
+    ("policies", "sim", "parallel"),
     ("tasks",),
     ("learn", "benchmark"),
-    ("deploy",),
-    ("show", "bench", "calibration", "export", "diagnose"),
-    ("mujoco",),
-    ("train_low", "train_high", "evaluate"),
+    ("calibration", "deploy", "show", "bench"),
+    ("diagnose", "export", "mujoco", "train_low", "train_high", "evaluate"),
     ("ablate",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
-SCRIPTS = FLOORS[-2]
+SCRIPTS = FLOORS[-2][-3:]
 #: Names that scripts of others import, each from where it is defined.
 DOORS = {
     "terrain": ("sim.terrain", {"make_tile"}),

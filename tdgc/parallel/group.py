@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.parallel.worker import Task
-from tdgc.sim.robot import Array
 from tdgc.state import State
 
 
@@ -42,7 +41,7 @@ class TaskGroup:
 
     def step(
         self, actions: NDArray[np.floating]
-    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
         """One step of all: (M, n) -> reward, terminated, truncated, (M,) each."""
         steps = [t.step(actions[rows]) for t, rows in zip(self.tasks, self._rows, strict=True)]
         reward, terminated, truncated = (

@@ -22,7 +22,8 @@ from tdgc.sim.commands import (
     gait_index,
     observed_command,
 )
-from tdgc.sim.gaits import GAITS, PhaseClock
+from tdgc.sim.gaits import GAITS, PhaseClock, foot_phases
+from tdgc.sim.geometry import Geometry
 from tdgc.sim.observation import ARROW, JOINTS, LEGS, TURN, Term, in_place, observe
 from tdgc.sim.robot import (
     NUM_JOINTS,
@@ -32,6 +33,7 @@ from tdgc.sim.robot import (
     joint_targets,
     nominal_height,
     nominal_pose,
+    walking_pose,
     yaw_quaternion,
 )
 from tdgc.sim.sensors import Noise
@@ -113,14 +115,31 @@ class Locomotion:
         if not self.robot.commanded_pose:
             return np.tile(self.nominal, (self.num_robots, 1))
         # An action is taken from the pose that was observed, if nobody changed anything between.
-        swing = self.swing()
-        follows = np.concatenate([self.command, swing], axis=1)
+        follows = np.column_stack([self.command, self.clock.clock, self.clock.cycles])
         if not np.array_equal(follows, self._pose_of):
             geometry = self.world.state.geometry
-            self._pose = commanded_pose(self.robot, geometry, self.command, swing)
+            if self.robot.commanded_gait:
+                self._pose = self._walking_pose(geometry)
+            else:
+                self._pose = commanded_pose(self.robot, geometry, self.command, self.swing())
             self._pose_of = follows
             self._pose.setflags(write=False)
         return self._pose
+
+    def _walking_pose(self, geometry: Geometry) -> Array:
+        """What joints should reach in the middle of the coming control step, for which they need
+        the time that they trail a moving target by, kd / kp."""
+        command, middle = self.executed(), 0.5 * self.physics.control_dt
+        phases, ahead = (
+            foot_phases(
+                np.mod(self.clock.clock + time * command[:, _FREQUENCY], 1.0),
+                command[:, 12:],
+                command[:, INDEX["duration"]],
+            )
+            for time in (middle, middle + self.robot.kd / self.robot.kp)
+        )
+        grown = self.clock.begun(self.robot.swing_ramp)
+        return walking_pose(self.robot, geometry, command, phases, ahead, grown)
 
     def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:
         """Stand the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)

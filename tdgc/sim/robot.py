@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from tdgc.config import RobotConfig
 from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.gaits import swing_profile
 from tdgc.sim.geometry import FRONT, JOINTS, SIDE, Geometry
 
 Array = NDArray[np.float64]
 
 NUM_JOINTS = len(JOINTS)
 
+GRAVITY = 9.81  # m/s^2
 HIGHEST_FOOT = -0.1  # m against the hips: no commanded pose folds a leg further
 
 
@@ -55,6 +57,81 @@ def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swin
     feet[..., 2] += change[:, INDEX["swing_height"], None] * swing
     feet[..., 2] = np.minimum(feet[..., 2], HIGHEST_FOOT)
     return leg_angles(geometry, feet)
+
+
+def foot_travel(command: Array, phases: Array, rest: Array) -> Array:
+    """How far feet are from their places at ``rest``, by Raibert's rule: (M, 15), (M, 4),
+    (M, 4, 2) m -> (M, 4, 2) m in the heading frame.
+
+    Half of what the ground moves under the foot in a stance: ahead at touch-down, behind at
+    lift-off, and back through the swing.
+    """
+    lead = np.abs(1.0 - 2.0 * phases) - 0.5
+    stance_time = command[:, INDEX["duration"]] / command[:, INDEX["frequency"]]
+    turn = command[:, INDEX["yaw_rate"], None]
+    ground_x = command[:, INDEX["vx"], None] - turn * rest[..., 1]
+    ground_y = command[:, INDEX["vy"], None] + turn * rest[..., 0]
+    travel = np.stack([ground_x, ground_y], axis=-1) * stance_time[:, None, None]
+    return np.asarray(lead[..., None] * travel)
+
+
+def walking_pose(
+    config: RobotConfig,
+    geometry: Geometry,
+    command: Array,
+    phases: Array,
+    ahead: Array,
+    grown: Array,
+) -> Array:
+    """q0(c, phi) of a robot that walks as it is told to, (M, 12) rad.
+
+    The feet stand under a trunk of the commanded height, pitch and roll, as wide and long apart as
+    asked; they run along Raibert's footholds and rise in swing to the commanded height. On top,
+    the load of the stance feet (``stance_load``) turns the joints by what the joint control needs
+    to carry it. It is where actions start from, not a constraint, see ``commanded_pose``.
+
+    Args:
+        config: the robot.
+        geometry: the robot's.
+        command: (M, 15), as carried out.
+        phases: (M, 4) of the feet.
+        ahead: (M, 4) the phases that joints reach their targets in.
+        grown: (M,) share of swing and travel so far, where a gait begins.
+    """
+    standing, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
+    change = command - default_command()
+    feet = np.repeat(standing, len(command), axis=0)
+    feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * FRONT
+    feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * SIDE
+    feet[..., :2] += grown[:, None, None] * foot_travel(command, ahead, feet[..., :2])
+    feet[..., 2] -= change[:, INDEX["body_height"], None]
+    feet[..., 2] += (grown * command[:, INDEX["swing_height"]])[:, None] * swing_profile(ahead)
+    pitch, roll = command[:, INDEX["pitch"], None], command[:, INDEX["roll"], None]
+    x, y, z = np.moveaxis(feet, -1, 0)
+    x, z = np.cos(pitch) * x - np.sin(pitch) * z, np.sin(pitch) * x + np.cos(pitch) * z
+    y, z = np.cos(roll) * y + np.sin(roll) * z, np.cos(roll) * z - np.sin(roll) * y
+    q = leg_angles(geometry, np.stack([x, y, np.minimum(z, HIGHEST_FOOT)], axis=-1))
+    load = stance_load(geometry, command, phases)
+    return q - load_torque(geometry, q, load) / config.kp
+
+
+def stance_load(geometry: Geometry, command: Array, phases: Array) -> Array:
+    """Vertical force on each foot that carries the robot, (M, 15), (M, 4) -> (M, 4) N: half a sine
+    over its stance, as large as the feet's mean over a cycle has to be its weight."""
+    weight = GRAVITY * sum(geometry.masses.values())
+    peak = 0.5 * np.pi * weight / (4.0 * command[:, INDEX["duration"], None])
+    return np.asarray(peak * np.maximum(np.sin(2.0 * np.pi * phases), 0.0))
+
+
+def load_torque(geometry: Geometry, q: Array, load: Array) -> Array:
+    """What a vertical ``load`` (M, 4) N on the feet does to joints at ``q`` (M, 12) rad, (M, 12)
+    N m: the last row of the feet's Jacobian times the load."""
+    hip, thigh, calf = np.moveaxis(q.reshape(-1, 4, 3), -1, 0)
+    x_thigh, x_calf = geometry.thigh * np.sin(thigh), geometry.calf * np.sin(thigh + calf)
+    down = -geometry.thigh * np.cos(thigh) - geometry.calf * np.cos(thigh + calf)
+    y = geometry.abduction * SIDE * np.cos(hip) - down * np.sin(hip)
+    row = np.stack([y, (x_thigh + x_calf) * np.cos(hip), x_calf * np.cos(hip)], axis=-1)
+    return (load[..., None] * row).reshape(-1, NUM_JOINTS)
 
 
 def action_scale(config: RobotConfig) -> Array:

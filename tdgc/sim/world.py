@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
 from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
 from tdgc.sim.robot import (
+    GRAVITY,
     NUM_JOINTS,
     Array,
     RobotState,
@@ -33,7 +34,6 @@ from tdgc.sim.robot import (
 from tdgc.sim.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
 
 _GROUND, _ROBOT = 1, 2  # collision groups: robots meet the ground and nothing else
-GRAVITY = 9.81  # m/s^2
 _PARKED = 50.0  # m above its place nothing touches a robot: terrain stays within HEIGHT_RANGE
 _SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out from it
 _FOOT_REACH = 0.03  # m below the foot's centre sits a contact that is the foot's, not the calf's
