@@ -10,10 +10,10 @@ import pytest
 
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.sim.commands import INDEX, observed_command
-from tdgc.sim.gaits import GAITS, gait_embedding, swing_profile
+from tdgc.sim.gaits import GAITS, foot_phases, gait_embedding
 from tdgc.sim.locomotion import GYRO_SCALE, SPEED_SCALE, Locomotion, actor_layout
 from tdgc.sim.observation import JOINTS, Flip, columns, width
-from tdgc.sim.robot import Array, commanded_pose, nominal_pose
+from tdgc.sim.robot import Array, nominal_pose, target_limits, walking_pose
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, Tile, make_tile
 from tdgc.tasks.ground import measure_ground
@@ -74,6 +74,7 @@ def test_observation_of_a_robot_that_stands(loco: Locomotion) -> None:
     assert loco.layout == actor_layout(gyro=True)
     expected = np.zeros(74)
     expected[2] = -1.0
+    expected[ACTOR["joint_error"]] = (NOMINAL - loco.pose())[0]
     expected[ACTOR["command"]] = observed_command(loco.executed()[0])
     np.testing.assert_allclose(seen, np.stack([expected] * 2), atol=1e-7)
 
@@ -111,7 +112,8 @@ def test_joints_actions_and_gyro(loco: Locomotion) -> None:
     state.derive()
     loco.actions[0, 1], loco.actions[1, 1] = 0.5, -0.25
     seen = loco.observe()[1]
-    np.testing.assert_allclose(seen[ACTOR["joint_error"]], np.arange(12) / 10 - 0.02, atol=1e-6)
+    error = NOMINAL + np.arange(12) / 10 - 0.02 - loco.pose()[1]
+    np.testing.assert_allclose(seen[ACTOR["joint_error"]], error, atol=1e-6)
     np.testing.assert_allclose(seen[ACTOR["joint_speed"]], np.arange(12) * SPEED_SCALE, atol=1e-6)
     assert SPEED_SCALE == 0.05
     assert seen[ACTOR["last_action"]].tolist() == [0.5] * 12
@@ -160,12 +162,15 @@ def test_noise_is_on_measured_parts_only_and_within_its_width(loco: Locomotion) 
 
 def test_act_clips_and_keeps_histories(loco: Locomotion) -> None:
     first, second = np.full((2, 12), 1.0), np.full((2, 12), -9.0)
-    loco.act(first)
-    loco.act(second)
+    poses = [np.tile(NOMINAL, (2, 1))]
+    for action in (first, second):
+        poses.insert(0, loco.pose().copy())
+        loco.act(action)
     assert (loco.actions[0] == -ROBOT.action_limit).all() and (loco.actions[1] == 1.0).all()
     scale = np.tile([0.125, 0.25, 0.25], 4)
+    limits = target_limits(ROBOT, loco.world.state.geometry)
     for age, action in enumerate([-4.0, 1.0, 0.0]):
-        expected = np.tile(NOMINAL + action * scale, (2, 1))
+        expected = np.clip(poses[age] + action * scale, *limits)
         np.testing.assert_allclose(loco.targets[age], expected, atol=1e-12)
     # Two steps, the first at 3.5 Hz, the second 0.07 of two cycles closer to 3 Hz.
     ran = 0.02 * 3.5 + 0.02 * (3.0 + 0.965 * 0.5)
@@ -196,11 +201,15 @@ def test_the_pose_is_never_stale(loco: Locomotion) -> None:
     """Whatever it follows from is changed in place or by a step: it is as derived anew."""
 
     def fresh() -> Array:
-        geometry = loco.world.state.geometry
-        grown = np.minimum(loco.clock.cycles, 1.0)[:, None]
-        return commanded_pose(
-            ROBOT, geometry, loco.command, grown * swing_profile(loco.clock.phases)
+        geometry, command = loco.world.state.geometry, loco.executed()
+        frequency, duty = command[:, INDEX["frequency"]], command[:, INDEX["duration"]]
+        # The middle of the coming step, and 0.6 / 20 s later, which joints trail their targets by.
+        now, ahead = (
+            foot_phases((loco.clock.clock + time * frequency) % 1.0, command[:, 12:], duty)
+            for time in (0.01, 0.01 + 0.03)
         )
+        grown = np.minimum(loco.clock.cycles, 1.0)
+        return walking_pose(ROBOT, geometry, command, now, ahead, grown)
 
     loco.clock.reset(np.arange(2), np.array([0.1, 0.35]))
     loco.observe()

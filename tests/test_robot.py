@@ -13,7 +13,7 @@ import pytest
 
 from tdgc.config import RobotConfig
 from tdgc.sim.commands import INDEX, default_command
-from tdgc.sim.gaits import FEET
+from tdgc.sim.gaits import FEET, GAIT_TABLE, foot_phases, swing_profile
 from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
 from tdgc.sim.robot import (
     HIGHEST_FOOT,
@@ -23,10 +23,13 @@ from tdgc.sim.robot import (
     foot_kinematics,
     joint_targets,
     leg_angles,
+    load_torque,
     nominal_pose,
     pd_torque,
     quaternion_product,
     rotation_matrix,
+    stance_load,
+    walking_pose,
     wrap_angle,
     yaw_quaternion,
 )
@@ -277,6 +280,63 @@ def test_commanded_pose_folds_no_leg_further_than_its_limit() -> None:
     pose = commanded_pose(CONFIG, GEOMETRY, command, np.ones((1, 4)))
     feet, _ = foot_kinematics(GEOMETRY, pose, np.zeros((1, 12)))
     np.testing.assert_allclose(feet[0, :, 2], HIGHEST_FOOT, atol=1e-9)
+
+
+def phases_of(rng: np.random.Generator, m: int) -> Array:
+    return rng.uniform(size=(m, 4))
+
+
+def test_walking_pose_puts_feet_where_commands_say() -> None:
+    """Without a load: on Raibert's footholds under a level trunk, as high as asked in swing."""
+    stiff = dataclasses.replace(CONFIG, kp=1e12)
+    rng = np.random.default_rng(0)
+    ahead = phases_of(rng, 6)
+    command = commands(
+        6, vx=0.5, vy=-0.2, yaw_rate=0.6, frequency=3.0, stance_width=0.3, swing_height=0.12
+    )
+    half = np.full(6, 0.5)  # of the first cycle
+    pose = walking_pose(stiff, GEOMETRY, command, phases_of(rng, 6), ahead, half)
+    feet, _ = foot_kinematics(GEOMETRY, pose, np.zeros((6, 12)))
+    rest, _ = foot_kinematics(GEOMETRY, nominal_pose(CONFIG)[None], np.zeros((1, 12)))
+    wider = 0.5 * (0.3 - default_command()[INDEX["stance_width"]])
+    rest = rest + [[[0.0, wider, 0.0], [0.0, -wider, 0.0]] * 2]
+    moved = feet - rest
+    np.testing.assert_allclose(moved[..., 2], 0.06 * swing_profile(ahead), atol=1e-9)
+    lead = 0.5 * (np.abs(1.0 - 2.0 * ahead) - 0.5) / 6.0  # s, half of a stance of 1/6 s
+    np.testing.assert_allclose(moved[..., 0], lead * (0.5 - 0.6 * rest[..., 1]), atol=1e-9)
+    np.testing.assert_allclose(moved[..., 1], lead * (-0.2 + 0.6 * rest[..., 0]), atol=1e-9)
+
+
+def test_walking_pose_turns_feet_about_the_trunk() -> None:
+    """In the world, with the trunk as asked, they are where they are under a level trunk."""
+    stiff, stance = dataclasses.replace(CONFIG, kp=1e12), np.full((2, 4), 0.25)
+    command = commands(2)
+    command[1, INDEX["pitch"]], command[1, INDEX["roll"]] = 0.25, -0.15
+    pose = walking_pose(stiff, GEOMETRY, command, stance, stance, np.ones(2))
+    feet, _ = foot_kinematics(GEOMETRY, pose, np.zeros((2, 12)))
+    turned = rotation_matrix(quaternion(-0.15, 0.25, 0.0))[0] @ feet[1].T
+    np.testing.assert_allclose(turned.T, feet[0], atol=1e-9)
+
+
+def test_load_torque_does_the_work_of_the_load() -> None:
+    rng = np.random.default_rng(1)
+    q, qd = rng.normal(0.0, 0.7, (50, 12)), rng.normal(0.0, 3.0, (50, 12))
+    load = rng.uniform(0.0, 80.0, (50, 4))
+    _, velocity = foot_kinematics(GEOMETRY, q, qd)
+    power = np.sum(load_torque(GEOMETRY, q, load) * qd, axis=1)
+    np.testing.assert_allclose(power, np.sum(load * velocity[..., 2], axis=1), atol=1e-9)
+
+
+@pytest.mark.parametrize("gait", range(4))
+def test_stance_loads_carry_the_robot_over_a_cycle(gait: int) -> None:
+    clock = (np.arange(1000) + 0.5) / 1000
+    command = commands(1000, duration=0.42)
+    command[:, 12:] = GAIT_TABLE[gait]
+    phases = foot_phases(clock, command[:, 12:], command[:, INDEX["duration"]])
+    load = stance_load(GEOMETRY, command, phases)
+    assert (load[phases > 0.5] == 0.0).all()
+    weight = 9.81 * sum(GEOMETRY.masses.values())
+    np.testing.assert_allclose(load.mean(axis=0), weight / 4.0, rtol=1e-4)
 
 
 def torque(error: float, speed: float, strength: float = 1.0) -> list[float]:

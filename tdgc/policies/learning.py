@@ -273,12 +273,16 @@ def load_into(path: str | os.PathLike[str], policy: ActorCriticPolicy) -> dict[s
     """
     header, tensors = read(path)
     mine = _describe(policy, header.meta)
-    names = ("kind", "activation", "lstm", "actor", "critic", "obs_dim", "actor_dim", "mirror")
+    names = ("kind", "activation", "lstm", "actor", "critic", "obs_dim", "actor_dim")
     for name in names:
         if getattr(mine, name) != getattr(header, name):
             raise PolicyFileError(
                 f"{path}: {name} is {getattr(header, name)}, this policy's {getattr(mine, name)}"
             )
+    if mine.mirror != header.mirror:
+        raise PolicyFileError(
+            f"{path}: its left-right mirror is not this policy's (ppo.mirror, env.probes)"
+        )
     if len(mine.low) != len(header.low):
         raise PolicyFileError(f"{path}: {len(header.low)} actions, this policy {len(mine.low)}")
     with th.no_grad():

@@ -18,7 +18,7 @@ import numpy as np
 from tdgc.config import HighRewardConfig, LowRewardConfig
 from tdgc.sim.commands import INDEX
 from tdgc.sim.geometry import FRONT, SIDE
-from tdgc.sim.robot import Array, RobotState
+from tdgc.sim.robot import Array, RobotState, foot_travel
 
 CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact
 _SOFT_LIMIT = 0.9  # share of a joint's range that costs nothing (Walk These Ways)
@@ -101,20 +101,13 @@ def orientation(s: LowStep) -> Array:
 def raibert_targets(command: Array, phases: Array) -> Array:
     """Footholds of Raibert's rule in the heading frame: (M, 15), (M, 4) -> (M, 4, 2) m.
 
-    Under the commanded stance rectangle, led by how far the ground moves under the foot in half
-    a stance: +1/2 at touch-down, -1/2 at lift-off, back to +1/2 through the swing.
+    The corners of the commanded stance rectangle, led by ``robot.foot_travel``.
     """
     half = 0.5 * np.stack(
         [command[:, INDEX["stance_length"]], command[:, INDEX["stance_width"]]], axis=-1
     )
     rest = half[:, None, :] * np.stack([FRONT, SIDE], axis=1)
-    lead = np.abs(1.0 - 2.0 * phases) - 0.5
-    stance_time = command[:, INDEX["duration"]] / command[:, INDEX["frequency"]]
-    turn = command[:, INDEX["yaw_rate"], None]
-    ground_x = command[:, INDEX["vx"], None] - turn * rest[..., 1]
-    ground_y = command[:, INDEX["vy"], None] + turn * rest[..., 0]
-    travel = np.stack([ground_x, ground_y], axis=-1) * stance_time[:, None, None]
-    return np.asarray(rest + lead[..., None] * travel)
+    return np.asarray(rest + foot_travel(command, phases, rest))
 
 
 def raibert_foothold(s: LowStep) -> Array:
