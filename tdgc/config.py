@@ -372,8 +372,7 @@ class PPOConfig:
     ent_coef: float = 0.0005
     vf_coef: float = 0.5
     max_grad_norm: float = 1.0
-    # Of actions on top of a pose that walks: at 1.0 robots fall 18 times a minute at first, at 0.5 XX.
-    initial_std: float = 0.5
+    initial_std: float = 1.0
     # SB3's 1e-5 swallows the critic's gradients: rewards carry dt and are below 0.03 a step.
     adam_eps: float = 1e-8
     actor: tuple[int, ...] = (256, 192)
