@@ -49,7 +49,7 @@ from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
 from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.parallel.worker import WorkerError
-from tdgc.policies import Policy
+from tdgc.policies import Policy, load
 from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, height_map, is_map
@@ -350,7 +350,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
             recordings += ran.recordings
             diagnoses += ran.diagnoses
             bar.update(len(ran.episodes))
-    print(describe(write_results(out, episodes)))
+    print(describe(write_results(out, episodes, editions(e, low, drivers))))
     plots.success_by_level(out / "summary.json", out / "success.png")
     plots.gait_shares(out, out / "gaits.png")
     plots.headings(out, out / "headings.png")
@@ -371,6 +371,15 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     except OSError as error:
         problems.append(f"no {report.NAME}: {error}")
     return problems
+
+
+def editions(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> dict[str, int]:
+    """Of the benchmark, that the policies were trained on; those of the first do not say so."""
+    used = {"low": low}
+    if "tdgc" in drivers:
+        assert evaluation.high is not None
+        used["high"] = load(evaluation.high)
+    return {name: int(policy.meta.get("benchmark", 1)) for name, policy in used.items()}
 
 
 def print_effect(effect: dict[str, Any]) -> None:

@@ -105,6 +105,16 @@ def test_the_summary_has_the_differences_beside_the_policies(tmp_path: Path) -> 
     assert list(json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))) == ["gp"]
 
 
+def test_the_table_says_which_edition_a_policy_was_trained_on(tmp_path: Path) -> None:
+    found = describe(write_results(tmp_path, EPISODES, {"low": 1, "high": 2}))
+    assert found.endswith(
+        "the low policy was trained on edition 1 of TDGC-Bench, these tiles are of edition 2"
+    )
+    assert "the high policy" not in found
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert summary["editions"] == {"tiles": 2, "low": 1, "high": 2}
+
+
 def test_the_table_says_where_dominance_fails(tmp_path: Path) -> None:
     lines = describe(write_results(tmp_path, EPISODES)).splitlines()
     at = lines.index("tdgc - gp on the same tiles, nominal")

@@ -5,16 +5,18 @@ from __future__ import annotations
 import csv
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tdgc.benchmark.evaluation import Episode
+from tdgc.sim.terrain import EDITION
 
-#: Key of summary.json beside the policies: "tdgc - gp" -> ``compare``.
-PAIRED = "paired"
+#: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``, and of which edition of the
+#: benchmark the tiles are and those that the policies were trained on.
+PAIRED, EDITIONS = "paired", "editions"
 # The rule of dominance (TDGC-Bench): ``tdgc`` is nowhere below ``gp``. What it has over ``cues`` is
 # what learning adds to the cues.
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
@@ -146,10 +148,9 @@ def describe(summary: dict[str, Any]) -> str:
     """A summary for the terminal: rates by family and level with their means, then the paired
     differences in points of success, and where the first policy is below the second."""
     lines: list[str] = []
-    for policy, conditions in summary.items():
-        if policy != PAIRED:
-            for condition, families in conditions.items():
-                lines += ["", f"{policy}, {condition}", *_rates(families)]
+    for policy, conditions in policies_of(summary).items():
+        for condition, families in conditions.items():
+            lines += ["", f"{policy}, {condition}", *_rates(families)]
     for pair, conditions in summary.get(PAIRED, {}).items():
         for condition, families in conditions.items():
             lines += ["", f"{pair} on the same tiles, {condition}"]
@@ -160,7 +161,19 @@ def describe(summary: dict[str, Any]) -> str:
                 )
                 text = f"{family.ljust(wide)}{points:+6.1f}  [{low:+.1f}, {high:+.1f}]"
                 lines.append(f"{text}  {verdict(pair, found)}".rstrip())
+    for name, edition in summary.get(EDITIONS, {}).items():
+        if edition != EDITION:
+            lines += [
+                "",
+                f"the {name} policy was trained on edition {edition} of TDGC-Bench, these tiles "
+                f"are of edition {EDITION}",
+            ]
     return "\n".join(lines)
+
+
+def policies_of(summary: dict[str, Any]) -> dict[str, Any]:
+    """The rates by policy of a ``summary``, without what stands beside them."""
+    return {key: value for key, value in summary.items() if key not in (PAIRED, EDITIONS)}
 
 
 def verdict(pair: str, found: dict[str, float]) -> str:
@@ -182,8 +195,12 @@ def _rates(families: dict[str, Any]) -> list[str]:
     return lines
 
 
-def write_results(folder: Path, episodes: Sequence[Episode]) -> dict[str, Any]:
+def write_results(
+    folder: Path, episodes: Sequence[Episode], editions: Mapping[str, int] | None = None
+) -> dict[str, Any]:
     """Write episodes.csv, summary.json and trajectories.npz into ``folder``; returns the summary.
+
+    ``editions`` are those of the benchmark that policies were trained on, by what they are called.
 
     trajectories.npz holds the tracks in the order of episodes.csv: ``poses`` (N, 3), those of all
     episodes one after another, ``counts`` (E,), how many are each one's, and ``goals`` (E, 2).
@@ -202,5 +219,7 @@ def write_results(folder: Path, episodes: Sequence[Episode]) -> dict[str, Any]:
     pairs = [pair for pair in _PAIRS if set(pair) <= summary.keys()]
     if pairs:
         summary[PAIRED] = {" - ".join(pair): compare(episodes, *pair) for pair in pairs}
+    if editions:
+        summary[EDITIONS] = {"tiles": EDITION, **editions}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
     return summary

@@ -26,7 +26,7 @@ from matplotlib.ticker import MaxNLocator
 
 from tdgc.benchmark.evaluation import POSE_SECONDS, tile_of
 from tdgc.benchmark.recording import Recording, spans, stretches
-from tdgc.benchmark.results import PAIRED
+from tdgc.benchmark.results import policies_of
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array, wrap_angle
@@ -98,8 +98,7 @@ def _of(runs: Sequence[_Run], policy: str, family: str) -> list[_Run]:
 
 def success_by_level(summary: Path, out: Path) -> None:
     """Success with 95 % intervals by level (summary.json): a row a condition, a column a family."""
-    table: dict[str, Any] = json.loads(summary.read_text(encoding="utf-8"))
-    table.pop(PAIRED, None)
+    table = policies_of(json.loads(summary.read_text(encoding="utf-8")))
     conditions = list(dict.fromkeys(c for rates in table.values() for c in rates))
     families = {
         condition: [f for f in next(iter(table.values()))[condition] if f != "mean"]

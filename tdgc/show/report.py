@@ -28,7 +28,7 @@ from tdgc.benchmark.evaluation import (
     Condition,
     EpisodeRecord,
 )
-from tdgc.benchmark.results import PAIRED, verdict
+from tdgc.benchmark.results import PAIRED, policies_of, verdict
 from tdgc.sim.terrain import file_label
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
@@ -289,8 +289,8 @@ def render(folder: Path) -> str:
         OSError: a file is missing or cannot be read.
         ValueError: a file holds what an evaluation does not write.
     """
-    summary, episodes = _json(folder / "summary.json"), _rows(folder / "episodes.csv")
-    paired = summary.pop(PAIRED, {})
+    written, episodes = _json(folder / "summary.json"), _rows(folder / "episodes.csv")
+    summary, paired = policies_of(written), written.get(PAIRED, {})
     names = [family for pair in paired.values() for found in pair.values() for family in found]
     has_diagnoses = (folder / "diagnosis.csv").is_file()
     diagnoses = _rows(folder / "diagnosis.csv") if has_diagnoses else []
