@@ -257,7 +257,7 @@ def test_results_have_a_row_and_a_track_an_episode(table):
         assert np.array_equal(data["goals"][:2], data["goals"][2:])
     summary = json.loads((table / "summary.json").read_text(encoding="utf-8"))
     assert (
-        list(summary) == ["tdgc", "gp", "paired"]
+        list(summary) == ["tdgc", "gp", "paired", "editions"]
         and summary["gp"]["nominal"]["gap"]["10"]["n"] == 2
     )
     figures = {path.name for path in table.glob("*.png")}
