@@ -79,15 +79,15 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--policies",
         help="all, or of tdgc (the hierarchy), gp (the scripted baseline), cues (a script on the "
         "cues of tdgc) and teacher (the script that tdgc imitated first, which is told where "
-        "everything is); all is tdgc and gp, the default where there is a high level, shipped or "
+        "everything is); all is tdgc and gp, the default where there is a high policy, shipped or "
         "given by --high, and otherwise gp",
     )
     parser.add_argument(
         "--conditions", default="nominal", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
     )
-    parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low-level policy")
-    parser.add_argument("--high", type=Path, help="high-level policy (the shipped one)")
-    parser.add_argument("--tracking", action="store_true", help="the low level alone, on the plane")
+    parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low policy")
+    parser.add_argument("--high", type=Path, help="high policy (the shipped one)")
+    parser.add_argument("--tracking", action="store_true", help="the low policy alone, on a plane")
     parser.add_argument(
         "--trace",
         metavar="WHICH",
@@ -118,7 +118,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         const="drive",
         choices=gui.MODES,
         help="Bullet's window instead of a table, on the first tile of the first family and level: "
-        "drive the low level with sliders (drive), or watch the first policy decide (watch)",
+        "drive the low policy with sliders (drive), or watch the first policy decide (watch)",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
     parser.add_argument(
@@ -179,7 +179,7 @@ class Evaluation:
         for name in filter(is_map, self.families):
             height_map(name)
         if "tdgc" in self.policies and self.high is None and self.mode != "tracking":
-            raise ValueError("no high level is shipped; give one with --high, or use --policies gp")
+            raise ValueError("no high policy is shipped: give one with --high, or --policies gp")
         self._check_mode()
         self._check_policies()
 
@@ -194,7 +194,7 @@ class Evaluation:
                 raise ValueError("--tracking has no episodes to film: no --video")
             if self.traced is not None or self.tuning is not None:
                 raise ValueError(
-                    "--tracking is of the low level alone: no --trace, --tune or --set"
+                    "--tracking is of the low policy alone: no --trace, --tune or --set"
                 )
 
     def _check_policies(self) -> None:

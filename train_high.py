@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Train the recurrent high level on top of a frozen low level, level by level.
+"""Train the recurrent high policy on top of a frozen low policy, level by level.
 
-python train_high.py                       the whole job, on the shipped low level
+python train_high.py                       the whole job, on the shipped low policy
 python train_high.py --low runs/low/policy
 python train_high.py --init tdgc/pretrained/high --set env.commands.vx=[-1,0.8]
 python train_high.py --resume --out runs/high

@@ -5,10 +5,10 @@
     python -m tdgc.bench --update
     python -m tdgc.bench --cluster auto
 
-Robots take random actions in the low level's MDP, on a plane and on all levels of all families,
+Robots take random actions in the low policy's MDP, on a plane and on all levels of all families,
 with one worker and with all. Writes ``bench.json`` and prints a table. With ``--load`` there are
 10, 100 and 1000 robots on the plane, with 1 to 8 workers, and then the learner alone, with 1 to
-16 threads; the table is in ``load.json``. With ``--update`` the high level's learner updates its
+16 threads; the table is in ``load.json``. With ``--update`` the high policy's learner updates its
 networks by sb3-contrib's own pass and by the fast one; the table is in ``update.json``. With
 ``--cluster`` robots on the plane are simulated by processes of this machine and by actors of Ray in
 turn; the table is in ``cluster.json``.
@@ -54,7 +54,7 @@ UPDATES = 80  # turns of ``--update``: other work shares the cores
 #: What ``--load`` compares.
 LOAD_ROBOTS, LOAD_WORKERS, LOAD_THREADS = (10, 100, 1000), (1, 2, 4, 8), (1, 2, 4, 8, 16)
 _SETTLE_STEPS = 20  # not timed: robots drop onto their feet
-_EPISODE = 100  # decisions, about the mean of the shipped high level's training
+_EPISODE = 100  # decisions, about the mean of the shipped high policy's training
 _TURNS = 10  # of each place in a comparison
 
 
@@ -118,7 +118,7 @@ def measure(config: LowLevelConfig, robots: int, workers: int, seconds: float) -
 
 
 def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
-    """Control steps a second that the low level's learner takes in, for about ``seconds``.
+    """Control steps a second that the low policy's learner takes in, for about ``seconds``.
 
     Each is taken ``n_epochs`` times, in minibatches, forwards and backwards through both networks.
     """
@@ -158,8 +158,8 @@ def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
 def update_seconds(
     config: HighTrainConfig, spaces: tuple[gym.spaces.Box, gym.spaces.Box], updates: int
 ) -> dict[str, float]:
-    """Seconds of the high level's update after one rollout: of sb3-contrib's own, ``stock``, and of
-    ``FastRecurrentPPO``, ``fast``; they take turns, ``updates`` each, and this is the median.
+    """Seconds of the high policy's update after one rollout: of sb3-contrib's own, ``stock``, and
+    of ``FastRecurrentPPO``, ``fast``; they take turns, ``updates`` each, and this is the median.
     ``ratio`` is the median of the turns' ratios, since other work on the machine hits both.
 
     The rollout is noise in which episodes start anywhere, one in ``_EPISODE`` decisions.
@@ -334,7 +334,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=10.0, help="a measurement (10)")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--load", action="store_true", help="compare robots, workers and threads")
-    what.add_argument("--update", action="store_true", help="compare the high level's updates")
+    what.add_argument("--update", action="store_true", help="compare the high policy's updates")
     what.add_argument("--cluster", metavar="ADDRESS", help=f"compare: {CLUSTER_HELP}")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     args = parser.parse_args(arguments)

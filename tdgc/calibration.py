@@ -1,4 +1,4 @@
-"""Calibration: a copy of a low level that walks as fast as it is told to.
+"""Calibration: a copy of a low policy that walks as fast as it is told to.
 
     python -m tdgc.calibration --low runs/low/policy --out runs/low/calibrated
 
@@ -339,7 +339,7 @@ def _walk(low: Policy, job: tuple[int, int]) -> tuple[Array, Array]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--low", type=Path, required=True, help="low level, with or without suffix")
+    parser.add_argument("--low", type=Path, required=True, help="low policy, suffix or not")
     parser.add_argument("--out", type=Path, required=True, help="where to write the copy, likewise")
     parser.add_argument("--robots", type=int, default=4800, help="that walk to be measured (4800)")
     parser.add_argument("--turns", type=int, default=60, help="of 60 control steps to learn (60)")

@@ -129,7 +129,7 @@ class CommandRanges:
 
 @dataclass(frozen=True)
 class LowRewardConfig:
-    """Weights of the low-level reward, one field per term of ``tdgc.tasks.rewards.LOW_TERMS``.
+    """Weights of the low policy's reward, one field per term of ``tdgc.tasks.rewards.LOW_TERMS``.
 
     Penalties of Walk These Ways (its published table), some changed by up to a factor of two where
     the first policies showed the need (docs/experiments.md); ``power`` is ours and is multiplied by
@@ -282,7 +282,7 @@ class LowLevelConfig:
 
 @dataclass(frozen=True)
 class HighRewardConfig:
-    """Weights and constants of the high-level reward (Sec. IV-B), one weight per term.
+    """Weights and constants of the high policy's reward (Sec. IV-B), one weight per term.
 
     Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the step's
     duration, unless ``step_time_scaling`` is off: then they are per decision.
@@ -357,7 +357,7 @@ class HighLevelConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """PPO and the networks of the low level; see docs/experiments.md for what was compared."""
+    """PPO and the networks of the low policy; see docs/experiments.md for what was compared."""
 
     # Times the mean standard deviation of the actions: as exploration shrinks, the same step of the
     # mean moves the policy further (the clipped share rose from 0.2 to 0.4 at a constant rate).
@@ -411,7 +411,7 @@ class LowTrainConfig:
 
 @dataclass(frozen=True)
 class RecurrentPPOConfig:
-    """RecurrentPPO and the networks of the high level: the paper's table but for the first two."""
+    """RecurrentPPO and the networks of the high policy: the paper's table but for the first two."""
 
     # The paper's 1e-4 needs more updates than two cores give. Above 3e-4 two fifths of the samples
     # were clipped.

@@ -255,7 +255,7 @@ class Pose(nn.Module):
 
 
 class LowLevel(nn.Module):
-    """One control step of the low level (Sec. IV-A): sensors and commands to joint targets.
+    """One control step of the low policy (Sec. IV-A): sensors and commands to joint targets.
 
     Attributes:
         inputs, outputs: what ``forward`` takes and gives, in order.
@@ -397,7 +397,7 @@ class HighLevel(nn.Module):
                 "clock",
                 1,
                 "1",
-                "the low level's in its coming step",
+                "the low policy's in its coming step",
                 start=0.0,
                 source="low.next_clock",
             ),
@@ -407,7 +407,7 @@ class HighLevel(nn.Module):
         ]
         self.outputs = [
             Signal("decision", NUM_ACTIONS, "1", "raw actions", "decision"),
-            Signal("commands", NUM_COMMANDS, None, "for the low level", "commands"),
+            Signal("commands", NUM_COMMANDS, None, "for the low policy", "commands"),
             Signal("next_hidden", hidden, "1", "state of the LSTM"),
             Signal("next_cell", hidden, "1", "cell of the LSTM"),
         ]
@@ -454,7 +454,7 @@ def _by_name(signals: Sequence[Signal], values: Sequence[Tensor]) -> dict[str, T
 
 @dataclass(frozen=True)
 class Pair:
-    """Both levels and the MDPs that they were trained on."""
+    """Both policies and the MDPs that they were trained on."""
 
     low: Policy
     low_config: LowLevelConfig
@@ -593,7 +593,7 @@ def _commands(ranges: CommandRanges) -> list[Table]:
 
 
 def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
-    """Write graphs and interface files of both levels and the URDF into ``folder``, which exists.
+    """Write graphs and interface files of both policies and the URDF into ``folder``, which exists.
 
     Raises:
         OSError: a file cannot be written.
@@ -648,8 +648,8 @@ class Check:
 
     Attributes:
         difference: the largest between an output of a graph and the policy's.
-        seconds: (control steps,) CPU time in the graphs: the low level's, and every decimation-th
-            step the high level's too.
+        seconds: (control steps,) CPU time in the graphs: the low policy's, and every decimation-th
+            step the high policy's too.
     """
 
     difference: float
@@ -735,9 +735,9 @@ def _choose_formats(text: str) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low level (shipped)")
+    parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low policy (shipped)")
     parser.add_argument(
-        "--high", type=Path, default=PRETRAINED / "high", help="high level (shipped)"
+        "--high", type=Path, default=PRETRAINED / "high", help="high policy (shipped)"
     )
     parser.add_argument("--out", type=Path, required=True, help="folder to write into")
     parser.add_argument("--format", default=",".join(FORMATS), help=f"of {', '.join(FORMATS)}")

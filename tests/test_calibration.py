@@ -194,7 +194,7 @@ def test_script(
         (["--low", "{0}/none"], "none.json: no such file"),
         (["--low", "{0}/low", "--robots", "63"], "--robots must be 64 or more, not 63"),
         (["--low", "{0}/low", "--turns", "0"], "--turns must be 1 or more, not 0"),
-        (["--low", "tdgc/pretrained/high"], "high: not a low-level policy of this package"),
+        (["--low", "tdgc/pretrained/high"], "high: not a low policy of this package"),
     ],
 )
 def test_bad_input_is_one_line(

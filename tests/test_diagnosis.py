@@ -70,7 +70,7 @@ class WeakMotor(HierarchyDriver):
 
 
 class Blindfold(HierarchyDriver):
-    """The high level sees flat ground of an unknown family and a goal where there is none."""
+    """The high policy sees flat ground of an unknown family and a goal where there is none."""
 
     def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
         angle = np.random.default_rng(0).uniform(-np.pi, np.pi, loco.num_robots)
@@ -238,7 +238,7 @@ def test_a_pillar_in_the_way_is_the_decisions_fault():
     hit = diagnose(walk("pillar", outcome="collided", track=into), HIPS)
     assert (hit.layer, hit.cause) == ("decisions", "steered into a pillar")
     assert hit.feature == f"0.25 m from pillar at ({px:.1f}, {y:.1f}) m"
-    # Pushing against it, the robot tracks nothing; that tells nothing of the low level.
+    # Pushing against it, the robot tracks nothing; that tells nothing of the low policy.
     pushing = walk("pillar", outcome="timeout", track=((x - 0.3, y), (x - 0.3, y)), error_vx=-0.5)
     assert verdict(pushing) == ("decisions", "held up by a pillar")
     # On the same tile, away from all pillars, it does.

@@ -61,7 +61,7 @@ def save_high(
     meta: dict[str, Any] | None = None,
     hidden: int | None = 8,
 ) -> Path:
-    """A small high level with random weights that walks about: gaits and commands vary."""
+    """A small high policy with random weights that walks about: gaits and commands vary."""
     size = size or width(high_layout(config.cues))
     policy = FastRecurrentPolicy(
         spaces.Box(-np.inf, np.inf, (size,)),
@@ -243,18 +243,18 @@ def test_a_low_level_that_does_not_match_is_refused_by_name(low, tmp_path):
     other = {"config": to_dict(config), "observation": policy.actor_dim - 3}
     path = save_high(tmp_path / "other", low, meta={"low": other})
     n = policy.actor_dim
-    with pytest.raises(ConfigError, match=f"low level that observes {n - 3} values, not {n}$"):
+    with pytest.raises(ConfigError, match=f"low policy that observes {n - 3} values, not {n}$"):
         load_high(path, *low)
 
 
 def test_files_that_are_no_high_level_are_refused(low, tmp_path):
-    with pytest.raises(ConfigError, match=r"low: not a high-level policy of this package$"):
+    with pytest.raises(ConfigError, match=r"low: not a high policy of this package$"):
         load_high(LOW, *low)
     path = save_high(tmp_path / "high", low, meta={"low": None})
     with pytest.raises(ConfigError, match=r"high: its meta lacks what it was trained on$"):
         load_high(path, *low)
     path = save_high(tmp_path / "high", low, size=80)
-    with pytest.raises(ConfigError, match=r"high level that observes 86 values, not 80$"):
+    with pytest.raises(ConfigError, match=r"high policy that observes 86 values, not 80$"):
         load_high(path, *low)
     with pytest.raises(policies.PolicyFileError, match=r"none.json: no such file$"):
         load_high(tmp_path / "none", *low)

@@ -284,7 +284,7 @@ def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, cap
     assert {row["policy"] for row in rows_of(tmp_path / "out")} == {"gp"}
     capsys.readouterr()
     assert evaluate.main(["--policies", "tdgc"]) == 2
-    message = "no high level is shipped; give one with --high, or use --policies gp"
+    message = "no high policy is shipped; give one with --high, or use --policies gp"
     assert capsys.readouterr().err == f"evaluate.py: {message}\n"
 
 
@@ -312,9 +312,9 @@ def test_flags_that_cannot_be_used(flags, message, capsys):
 
 def test_a_policy_of_the_wrong_kind(high, capsys):
     assert evaluate.main(["--low", str(high)]) == 2
-    assert capsys.readouterr().err.endswith("high: not a low-level policy of this package\n")
+    assert capsys.readouterr().err.endswith("high: not a low policy of this package\n")
     assert evaluate.main(["--high", str(PRETRAINED / "low")]) == 2
-    assert capsys.readouterr().err.endswith("low: not a high-level policy of this package\n")
+    assert capsys.readouterr().err.endswith("low: not a high policy of this package\n")
 
 
 def test_an_evaluation_checks_itself():
@@ -326,7 +326,7 @@ def test_an_evaluation_checks_itself():
         ({"filmed": 101}, "--video must lie in [0, --episodes], not 101"),
         ({"mode": "watch", "cluster": "auto"}, "--gui shows a robot of this machine"),
         ({"mode": "tracking", "filmed": 1}, "--tracking has no episodes to film"),
-        ({"policies": ("tdgc",), "high": None}, "no high level is shipped"),
+        ({"policies": ("tdgc",), "high": None}, "no high policy is shipped"),
         ({"policies": ("teacher",), "conditions": ("no-family",)}, "it cannot lead in no-family"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):

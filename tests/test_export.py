@@ -62,7 +62,7 @@ def shake(policy: ActorCriticPolicy) -> None:
 def random_high(
     path: Path, config: HighLevelConfig, low: LowLevelConfig = LOW_CONFIG, hidden: int | None = 32
 ) -> Path:
-    """A high level with random weights, saved as ``train_high.py`` saves one."""
+    """A high policy with random weights, saved as ``train_high.py`` saves one."""
     size = width(high_layout(config.cues))
     limit = config.action_limit
     mirror = high_mirror(config) if config.probes == "lines" else None
@@ -139,7 +139,7 @@ def high(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both levels in all formats: the shipped low level and a random high level."""
+    """Both levels in all formats: the shipped low policy and a random high policy."""
     path = tmp_path_factory.mktemp("export")
     export.write(export.load_pair(LOW, high), path, list(FORMATS))
     return path
@@ -147,7 +147,7 @@ def folder(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A high level of episodes of a second, and the pair beside it as TorchScript."""
+    """A high policy of episodes of a second, and the pair beside it as TorchScript."""
     path = tmp_path_factory.mktemp("short")
     config = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
     pair = export.load_pair(LOW, random_high(path / "policy", config))
@@ -558,7 +558,7 @@ def test_command_writes_checks_and_reports(
 
 
 def save_pairs(path: Path) -> None:
-    """High levels that do not fit the shipped low level, and one that does."""
+    """High policies that do not fit the shipped low policy, and one that does."""
     fast = dataclasses.replace(HIGH_CONFIG.commands, vx=(-1.0, 1.5))
     physics = dataclasses.replace(LOW_CONFIG.physics, control_dt=0.01)
     random_high(path / "high", HIGH_CONFIG, hidden=4)
@@ -584,11 +584,11 @@ def save_pairs(path: Path) -> None:
         ("--high {0}/high --format onnx,tflite", "unknown format 'tflite'; allowed: onnx, torchs"),
         ("--high {0}/absent", "absent.json: no such file"),
         ("--high {0}/high --low {0}/absent", "absent.json: no such file"),
-        ("--high {0}/high --low {0}/high", "high: not a low-level policy"),
-        ("--high {low}", "low: not a high-level policy"),
+        ("--high {0}/high --low {0}/high", "high: not a low policy"),
+        ("--high {low}", "low: not a high policy"),
         ("--high {0}/fast", "commands.vx asks for [-1.0, 1.5], but the low policy was trained on"),
-        ("--high {0}/slow", "trained for a low level with a control step of 0.01 s, not 0.02"),
-        ("--high {0}/blind", "trained for a high level that observes 48 values, not 86"),
+        ("--high {0}/slow", "trained for a low policy with a control step of 0.01 s, not 0.02"),
+        ("--high {0}/blind", "trained for a high policy that observes 48 values, not 86"),
         ("--high {0}/high --low {0}/dizzy", "dizzy: its configuration gives "),
         ("--high {0}/forward", "forward: only a recurrent high policy can be exported"),
         ("--high {0}/high --out {0}/file/out", "Not a directory"),

@@ -394,7 +394,7 @@ def test_weights_of_other_shapes_and_numbers(
 
 @pytest.fixture(scope="module")
 def pair(folder: Path) -> dict[str, Any]:
-    """A low and a high level, and what their JSON holds."""
+    """A low and a high policy, and what their JSON holds."""
     for kind in ("json", "safetensors"):
         shutil.copy(f"{PRETRAINED / 'low'}.{kind}", f"{folder / 'low'}.{kind}")
     save_high(folder / "high", load_low(folder / "low"))

@@ -487,7 +487,7 @@ def test_the_future_follows_from_the_state(episodes, guided):
 
 
 def test_a_robot_that_blows_up_in_a_decision_is_seen_in_the_observation(task):
-    """Its low level has no action then; the decision goes on for the others."""
+    """Its low policy has no action then; the decision goes on for the others."""
     task.reset(np.arange(5))
     task.locomotion.world.strength[1] = np.nan
     with np.errstate(invalid="ignore"):

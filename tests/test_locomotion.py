@@ -1,4 +1,4 @@
-"""The executor: what the low level sees, in which frame and sign, and its left-right mirror."""
+"""The executor: what the low policy sees, in which frame and sign, and its left-right mirror."""
 
 import dataclasses
 import math
@@ -438,7 +438,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
 
 
 def test_phases_follow_the_clock_of_a_placed_robot() -> None:
-    """Before any step: what the high level sees first is this episode's clock."""
+    """Before any step: what the high policy sees first is this episode's clock."""
     loco = Locomotion(2, RobotConfig(), PhysicsConfig(), None)
     loco.place(np.arange(2), np.array([[0.0, 0.0], [5.0, 0.0]]), np.zeros(2), np.array([0.1, 0.35]))
     # Trot with a duty factor of one half: FL and RR half a cycle ahead of FR and RL.

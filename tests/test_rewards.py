@@ -374,7 +374,7 @@ def test_desired_contact_of_a_trot_weighs_the_diagonal_in_swing() -> None:
     np.testing.assert_allclose(rewards.swing_contact_force(step), [0.0, 0.5], atol=1e-3)
 
 
-# ------------------------------------------------------------------ high level
+# ------------------------------------------------------------------ high policy
 
 
 def high_step(**changes: object) -> HighStep:

@@ -89,7 +89,7 @@ def watched_high(low, tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="module")
 def watched(low, watched_high):
-    """The notes, traces and episodes of a high level that is quick to change its mind."""
+    """The notes, traces and episodes of a high policy that is quick to change its mind."""
     driver = HierarchyDriver(*watched_high)
     return watch(driver, Cell("tdgc", "nominal", "rough", 8, 3, 2), low[0])
 
@@ -427,7 +427,7 @@ def test_without_pyarrow_the_script_says_what_to_install(tmp_path, monkeypatch, 
         (["--trace", "0"], "--trace must be all, failed or a number from 1, not '0'"),
         (
             ["--tracking", "--trace", "all"],
-            "--tracking is of the low level alone: no --trace, --tune or --set",
+            "--tracking is of the low policy alone: no --trace, --tune or --set",
         ),
     ],
 )

@@ -395,7 +395,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.7",
         "--set", "imitation.steps=16",
     ]  # fmt: skip
-    monkeypatch.chdir(ROOT)  # the shipped low level is named from there
+    monkeypatch.chdir(ROOT)  # the shipped low policy is named from there
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert (
         train_high.main([*arguments, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0

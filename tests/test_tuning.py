@@ -44,7 +44,7 @@ def low():
 
 @pytest.fixture(scope="module")
 def pair(low, tmp_path_factory: pytest.TempPathFactory):
-    """A high level with random weights whose gaits and commands vary."""
+    """A high policy with random weights whose gaits and commands vary."""
     return load_high(save_high(tmp_path_factory.mktemp("policy") / "high", low), *low)
 
 
@@ -158,8 +158,8 @@ def test_the_policy_sees_its_own_decisions(pair, loco):
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("decoder.vx.high=1.2", r"decoder.vx.high=1.2: the low level was trained on \[-1.0, 1.0\]"),
-        ("decoder.vx.low=-3", r"decoder.vx.low=-3.0: the low level was trained on \[-1.0, 1.0\]"),
+        ("decoder.vx.high=1.2", r"vx.high=1.2: the low policy was trained on \[-1.0, 1.0\]"),
+        ("decoder.vx.low=-3", r"decoder.vx.low=-3.0: the low policy was trained on \[-1.0, 1.0\]"),
         ("decoder.vx.high=0.9", r"a bound can only narrow the policy's \[-0.8, 0.8\]"),
         ("decoder.vx={\"low\": 0.5, \"high\": 0.2}", "the lower bound 0.5 is above the upper 0.2"),
         ("decoder.gaits=[]", r"must name some of trot, pronk, pace, bound, each once, not \[\]"),
@@ -363,11 +363,11 @@ def test_the_script_shows_both_beside_each_other(tmp_path, capsys):
         (["--tune", "none.json"], "none.json: No such file or directory"),
         (
             ["--set", "decoder.vx.high=1.5"],
-            "decoder.vx.high=1.5: the low level was trained on [-1.0, 1.0]",
+            "decoder.vx.high=1.5: the low policy was trained on [-1.0, 1.0]",
         ),
         (
             ["--tracking", "--set", "decision_rate=5"],
-            "--tracking is of the low level alone: no --trace, --tune or --set",
+            "--tracking is of the low policy alone: no --trace, --tune or --set",
         ),
     ],
 )

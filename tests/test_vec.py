@@ -263,7 +263,7 @@ if __name__ == "__main__":
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 def test_workers_have_no_torch(tmp_path: Path) -> None:
-    """The low level's have none, nor do they import the script, unless the task is from there."""
+    """The low policy's have none, nor do they import the script, unless the task is from there."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}

@@ -1,7 +1,7 @@
 """Diagnosis: why an episode failed, from its trace; which layer is to blame, and on what evidence.
 
 - ``terrain``: the tile is of a kind that nothing was trained on.
-- ``execution``: the low level lost track of its commands, or the robot fell under a sane one.
+- ``execution``: the low policy lost track of its commands, or the robot fell under a sane one.
 - ``decisions``: the commands were carried out, and they led to the failure; or the robot walked
   into a trench that nothing had looked for.
 

@@ -1,4 +1,4 @@
-"""Who decides on commands: the hierarchy's high level, or the paper's scripted baseline."""
+"""Who decides on commands: the hierarchy's high policy, or the paper's scripted baseline."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Driver(Protocol):
 
 @dataclass(frozen=True)
 class GoToGoal:
-    """``gp``, the paper's baseline: a scripted law over the same frozen low level.
+    """``gp``, the paper's baseline: a scripted law over the same frozen low policy.
 
     Walks in trot with default behaviour parameters, as fast as the distance asks, turning by the
     heading error, and slows while it faces away. No terrain cues. Gains tuned on training tiles
@@ -109,11 +109,11 @@ class BaselineDriver:
 class TeacherDriver:
     """Drives robots by the scripted teacher, decided as often as the hierarchy decides.
 
-    It is told what the hierarchy has to find out, so it is no rival: it shows what the low level
+    It is told what the hierarchy has to find out, so it is no rival: it shows what the low policy
     can do when it is told the right thing.
 
     Args:
-        low, config: the low level, whose leaps are measured first.
+        low, config: the low policy, whose leaps are measured first.
     """
 
     def __init__(self, low: Policy, config: LowLevelConfig) -> None:
@@ -146,7 +146,7 @@ class Decides(Protocol):
 
 
 class HierarchyDriver:
-    """Drives robots by the high level (paper Sec. IV-B), ``tdgc``; recurrent or feed-forward.
+    """Drives robots by the high policy (paper Sec. IV-B), ``tdgc``; recurrent or feed-forward.
 
     A decision is deterministic and its commands are held for ``decimation`` control steps.
 
@@ -205,16 +205,16 @@ class HierarchyDriver:
 def load_high(
     path: str | Path, low: Policy, low_config: LowLevelConfig
 ) -> tuple[Policy, HighLevelConfig]:
-    """A high-level policy and the MDP it was trained on, for use on the low level ``low``.
+    """A high policy and the MDP it was trained on, for use on the low policy ``low``.
 
     Raises:
-        ValueError: a file that cannot be used, one that is no high level, or one that was trained
-            on a low level with another robot, observation, control rate or narrower commands; the
+        ValueError: a file that cannot be used, one that is no high policy, or one that was trained
+            on a low policy with another robot, observation, control rate or narrower commands; the
             message names the mismatch.
     """
     high = policies.load(path)
     if high.action_dim != NUM_ACTIONS:
-        raise ConfigError(f"{path}: not a high-level policy of this package")
+        raise ConfigError(f"{path}: not a high policy of this package")
     try:
         config = recorded(HighLevelConfig, high.meta["config"], path)
         trained_on = recorded(LowLevelConfig, high.meta["low"]["config"], f"{path}, meta.low")
@@ -225,13 +225,13 @@ def load_high(
         wanted, given = (getattr(c.robot, field.name) for c in (trained_on, low_config))
         if wanted != given:
             raise ConfigError(
-                f"{path}: trained for a low level with robot.{field.name} {wanted}, not {given}"
+                f"{path}: trained for a low policy with robot.{field.name} {wanted}, not {given}"
             )
     for what, wanted, given in (
-        ("a high level that observes {} values", width(high_layout(config.cues)), high.obs_dim),
-        ("a low level that observes {} values", observation, low.actor_dim),
+        ("a high policy that observes {} values", width(high_layout(config.cues)), high.obs_dim),
+        ("a low policy that observes {} values", observation, low.actor_dim),
         (
-            "a low level with a control step of {} s",
+            "a low policy with a control step of {} s",
             trained_on.physics.control_dt,
             low_config.physics.control_dt,
         ),

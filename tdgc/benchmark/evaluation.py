@@ -144,18 +144,18 @@ class Episode(EpisodeRecord):
 
 
 def low_config(low: Policy) -> LowLevelConfig:
-    """The MDP that a low-level policy was trained on, from its own file.
+    """The MDP that a low policy was trained on, from its own file.
 
     Raises:
         ValueError: the file holds none, or one that does not fit the policy.
     """
     if "config" not in low.meta:
-        raise ValueError("the low-level policy's file has no configuration")
-    return recorded(LowLevelConfig, low.meta["config"], "the low level's configuration")
+        raise ValueError("the low policy's file has no configuration")
+    return recorded(LowLevelConfig, low.meta["config"], "the low policy's configuration")
 
 
 def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
-    """The condition's physics: its rate, at the low level's control rate."""
+    """The condition's physics: its rate, at the low policy's control rate."""
     physics = config.physics
     if condition.physics_hz is not None:
         substeps = round(physics.control_dt * condition.physics_hz)
@@ -350,7 +350,7 @@ def run_cell(
 
     Args:
         cell: which episodes.
-        low: the frozen low level.
+        low: the frozen low policy.
         driver: what commands it.
         seed: of the evaluation's tiles.
         watcher: who looks on.

@@ -81,7 +81,7 @@ def _columns() -> Iterator[Column]:
     yield Column("roll", "rad", "of the trunk, left side up positive")
     yield Column("goal_distance", "m", "from the trunk to the goal")
     yield Column("goal_bearing", "rad", "of the goal against the heading, to the left positive")
-    yield Column("family", "", "cue: the terrain family that the high level was told")
+    yield Column("family", "", "cue: the terrain family that the high policy was told")
     for name, (x, y) in zip(_PROBES, PROBES["lines"], strict=True):
         where = f"({x:g}, {y:g}) m ahead and to the left"
         yield Column(name, "m", f"cue: ground {where}, against where a standing robot's would be")
@@ -106,7 +106,7 @@ def _columns() -> Iterator[Column]:
     yield Column("leg_force", "N", "largest normal force on a leg above its foot")
     yield Column("power", "W", "mean of the sum of |torque x speed| of the joints")
     for name in _REWARDS:
-        yield Column(name, "1", "term of the high level's reward, weighted")
+        yield Column(name, "1", "term of the high policy's reward, weighted")
 
 
 #: All columns in order. Numbers are float32. A value that there is none of is null: decisions, and

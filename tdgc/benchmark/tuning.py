@@ -111,11 +111,11 @@ def tuned_ranges(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -
 
     Args:
         tuning: the changes.
-        config: of the high level that is tuned.
-        low: of the low level, whose ``commands`` are what it was trained on.
+        config: of the high policy that is tuned.
+        low: of the low policy, whose ``commands`` are what it was trained on.
 
     Raises:
-        ConfigError: a bound outside what the low level was trained on, one that is wider than the
+        ConfigError: a bound outside what the low policy was trained on, one that is wider than the
             policy's own, so that it would change nothing, or a lower bound above its upper one.
     """
     ranges = {}
@@ -126,7 +126,7 @@ def tuned_ranges(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -
             value = getattr(limits, side)
             what = f"decoder.{name}.{side}={value}"
             if value is not None and not trained[0] <= value <= trained[1]:
-                raise ConfigError(f"{what}: the low level was trained on {list(trained)}")
+                raise ConfigError(f"{what}: the low policy was trained on {list(trained)}")
             if value is not None and not own[0] <= value <= own[1]:
                 raise ConfigError(f"{what}: a bound can only narrow the policy's {list(own)}")
         bottom = own[0] if limits.low is None else limits.low
@@ -180,7 +180,7 @@ def check(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> None:
             bottom, top = getattr(low.commands, command)
             if value is not None and not bottom <= 0.0 <= top:
                 raise ConfigError(
-                    f"safety.{name} slows down to 0: the low level was trained on {command} from "
+                    f"safety.{name} slows down to 0: the low policy was trained on {command} from "
                     f"{bottom} to {top}"
                 )
     same = (
@@ -199,7 +199,7 @@ class TunedDriver(HierarchyDriver):
 
     Args:
         high, config: what ``load_high`` returned.
-        low: the low level's MDP.
+        low: the low policy's MDP.
         tuning: the limits.
 
     Raises:

@@ -25,7 +25,7 @@ from tdgc.parallel.worker import (
 from tdgc.state import State, copies
 
 #: Faults of workers within so many steps that stop a run. A fault of the code comes back at once
-#: or in every episode, and the low level's last 1000 steps; one of the machine does not. Workers
+#: or in every episode, and the low policy's last 1000 steps; one of the machine does not. Workers
 #: that fail in one step count once: a machine takes all of its own with it.
 FAULTS, FAULT_STEPS = 3, 1000
 # s to start in: ten times what imports and 60 robots' worlds took on a core shared by ten.

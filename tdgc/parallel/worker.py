@@ -4,7 +4,7 @@ A worker answers one word at a time. Actions, observations, rewards and flags li
 that dies with its processes; the pipes carry single words and now and then a state. Robots that
 blow up are reset where they are simulated.
 
-Nothing here imports PyTorch or Stable-Baselines3, and neither does the low level's task: a worker
+Nothing here imports PyTorch or Stable-Baselines3, and neither does the low policy's task: a worker
 would take 150 MB more.
 """
 
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from tdgc.state import State
 
 #: Observations and rewards are scaled to be of order one; beyond this a robot has blown up. For the
-#: low level it means 50 m/s, 400 rad/s or 10 m above the ground.
+#: low policy it means 50 m/s, 400 rad/s or 10 m above the ground.
 SANE = 100.0
 
 

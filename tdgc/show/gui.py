@@ -1,4 +1,4 @@
-"""Bullet's own window: drive the low level by hand, or watch a policy decide on a tile.
+"""Bullet's own window: drive the low policy by hand, or watch a policy decide on a tile.
 
 The window only shows the robot; it is simulated apart, as everywhere else. So nothing that is done
 to the window changes what the robot does, except through the sliders.
@@ -74,7 +74,7 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
     pressed.
 
     Args:
-        low: the low level.
+        low: the low policy.
         cell: says which tile; its policy does not matter.
         seed: of the evaluation's tiles.
 
@@ -141,7 +141,7 @@ def watch(low: Policy, driver: Driver, cell: Cell, seed: int) -> None:
     """Show one episode at the pace of real time, then its end until the window is closed.
 
     Args:
-        low: the low level.
+        low: the low policy.
         driver: what commands it.
         cell: the episode; its count is 1.
         seed: of the evaluation's tiles.

@@ -41,7 +41,7 @@ POLICY_COLOURS = {
 GAIT_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7")
 _GROUND = LinearSegmentedColormap.from_list("ground", ["#ffffff", "#707070"])  # low to high
 
-_MOVING = 0.1  # m/s, slower than that is no direction of travel (v_th of the high level's rewards)
+_MOVING = 0.1  # m/s, slower than that is no direction of travel (v_th of the high policy's rewards)
 _SECTORS = 24  # of 15 degrees
 _DRAWN = 3  # episodes a family and policy in the figure of trajectories
 
@@ -388,7 +388,7 @@ def _draw_command(
 
 
 def training_curve(log: Path, out: Path) -> None:
-    """The low level's run: reward, tracking and contact by gait, terrain levels (log.jsonl)."""
+    """The low policy's run: reward, tracking and contact by gait, terrain levels (log.jsonl)."""
     panels: list[tuple[str, dict[str, str] | str]] = [
         ("reward a step", {"reward/total": "total"}),
         ("velocity RMSE (m/s)", {f"tracking/{g}_velocity_rmse": g for g in GAITS}),
@@ -401,7 +401,7 @@ def training_curve(log: Path, out: Path) -> None:
 
 
 def decision_curve(log: Path, out: Path) -> None:
-    """The high level's run: reward, success, levels and pronk by family (log.jsonl).
+    """The high policy's run: reward, success, levels and pronk by family (log.jsonl).
 
     A dotted line is where imitation ends. Until then success is that of the episodes which the
     teacher does not drive.

@@ -67,7 +67,7 @@ _OBSERVATION_ZERO: NDArray[np.float64] = np.concatenate([default_command()[:12],
 
 
 def observed_command(command: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Commands (..., 15) as the low level's network sees them."""
+    """Commands (..., 15) as the low policy's network sees them."""
     return np.asarray((command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT)
 
 

@@ -141,7 +141,7 @@ class PhaseClock:
         self.contact = desired_contact(self.phases)
 
     def signal(self) -> NDArray[np.float64]:
-        """phi_t: sin(2 pi phase) of each foot, (M, 4), as the low level sees it."""
+        """phi_t: sin(2 pi phase) of each foot, (M, 4), as the low policy sees it."""
         return np.sin(2.0 * np.pi * self.phases)
 
     def begun(self, cycles: float) -> NDArray[np.float64]:

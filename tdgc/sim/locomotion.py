@@ -1,9 +1,9 @@
-"""The executor that both levels share: robots in a world, driven by commands and actions.
+"""The executor that both policies share: robots in a world, driven by commands and actions.
 
-``Locomotion`` turns low-level actions into joint targets, keeps the phase clock and the histories,
-applies domain randomisation and builds the low level's observation s^L of Sec. IV-A. It knows
-nothing of rewards or tasks; ``tdgc.tasks.low_env`` trains on it and ``tdgc.tasks.high_env`` drives
-it.
+``Locomotion`` turns the low policy's actions into joint targets, keeps the phase clock and the
+histories, applies domain randomisation and builds the low policy's observation s^L of Sec. IV-A. It
+knows nothing of rewards or tasks; ``tdgc.tasks.low_env`` trains on it and ``tdgc.tasks.high_env``
+drives it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The decision-level MDP (paper Sec. IV-B, IV-C) around a frozen low-level policy.
+"""The decision-level MDP (paper Sec. IV-B, IV-C) around a frozen low policy.
 
 ``NavigationTask`` is the MDP for M robots at once, each on a tile of its own whose level the
 curriculum sets; ``NavigationEnv`` is its Gymnasium face for one.
@@ -249,27 +249,27 @@ def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
 
 
 def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
-    """A low-level policy, given itself or by its path, and the MDP it was trained on.
+    """A low policy, given itself or by its path, and the MDP it was trained on.
 
     Raises:
-        ValueError: a file that cannot be used, or a policy that is no low level.
+        ValueError: a file that cannot be used, or a policy that is no low policy.
     """
     name, low = low, low if isinstance(low, Policy) else policies.load(low)
     if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
-        raise ConfigError(f"{name}: not a low-level policy of this package")
+        raise ConfigError(f"{name}: not a low policy of this package")
     return low, recorded(LowLevelConfig, low.meta["config"], name)
 
 
 class NavigationTask:
-    """The high-level MDP of M robots.
+    """The high policy's MDP of M robots.
 
     An action is (M, 13) in [-a_max, a_max]; it is decoded and held for ``decimation`` control
-    steps of the frozen low level. An episode fails when the trunk is low, hits something hard, or
+    steps of the frozen low policy. An episode fails when the trunk is low, hits something hard, or
     the robot leaves its tile; it is truncated after 20 s, or 2 s after the goal was reached.
 
     Args:
         config: the MDP's configuration.
-        low: the low-level policy, or its path; a task that is made on another machine needs the
+        low: the low policy, or its path; a task that is made on another machine needs the
             policy itself.
         num_robots: M.
         seed: of everything random here.
@@ -278,7 +278,7 @@ class NavigationTask:
         guided: decisions of each robot in which a teacher helps, see ``tdgc.learn.imitation``. Its
             actions follow the observation, and it drives a share of the episodes that falls from
             all to none over the first ``_GUIDANCE`` of these decisions.
-        landing: of the low level, for the teacher.
+        landing: of the low policy, for the teacher.
     """
 
     def __init__(
@@ -384,7 +384,7 @@ class NavigationTask:
     ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """One decision: (M, 13) -> reward, terminated, truncated, (M,) each.
 
-        The order is the paper's: physics and low level, terminations and reaching, reward; the
+        The order is the paper's: physics and low policy, terminations and reaching, reward; the
         caller resets afterwards.
 
         Raises:

@@ -1,6 +1,6 @@
 """Reward terms: one pure function each, on arrays of M robots, and the tables that weigh them.
 
-Low level (Sec. IV-A): the terms of Walk These Ways that the paper names or needs. A term returns
+Low policy (Sec. IV-A): the terms of Walk These Ways that the paper names or needs. A term returns
 the raw quantity, (M,); its sign and weight come from ``LowRewardConfig``. ``total`` combines them
 as Walk These Ways does, so that good gait multiplies what tracking earns:
 
@@ -29,7 +29,7 @@ _LEG_FORCE = 0.1  # N, a leg contact that counts (Walk These Ways)
 
 @dataclass
 class LowStep:
-    """All that the low-level terms look at, one control step of M robots.
+    """All that the low policy's terms look at, one control step of M robots.
 
     Attributes:
         state: the robots after the step.
@@ -202,7 +202,7 @@ def power(s: LowStep) -> Array:
     return s.cmd("power_weight") * np.sum(np.abs(s.state.torque * s.state.qd), axis=1)
 
 
-#: Terms of the low level by name; the weights are the fields of ``LowRewardConfig``.
+#: Terms of the low policy by name; the weights are the fields of ``LowRewardConfig``.
 LOW_TERMS: dict[str, Callable[[LowStep], Array]] = {
     f.__name__: f
     for f in (
@@ -260,12 +260,12 @@ def total(
     return np.asarray(dt * positive * np.exp(penalty * negative))
 
 
-# ---------------------------------------------------------------------------- high level
+# ---------------------------------------------------------------------------- high policy
 
 
 @dataclass
 class HighStep:
-    """All that the high-level terms look at, one decision of M robots (Sec. IV-B).
+    """All that the high policy's terms look at, one decision of M robots (Sec. IV-B).
 
     Attributes:
         distance: (M,) m to the goal, d_t.
@@ -358,7 +358,7 @@ def alive(s: HighStep) -> Array:
     return np.ones_like(s.distance)
 
 
-#: Terms of the high level by the name of their weight in ``HighRewardConfig``.
+#: Terms of the high policy by the name of their weight in ``HighRewardConfig``.
 HIGH_TERMS: dict[str, Callable[[HighStep], Array]] = {
     "goal_distance": goal_distance,
     "face": face,
@@ -379,7 +379,7 @@ def high_terms(step: HighStep, dt: float) -> dict[str, Array]:
     """Every enabled term times its effective weight w_i dt (step-time scaling), (M,) each; w_i
     alone without ``step_time_scaling``.
 
-    The high level's reward is their plain sum.
+    The high policy's reward is their plain sum.
     """
     scale = dt if step.config.step_time_scaling else 1.0
     return {

@@ -1,7 +1,7 @@
-"""A scripted expert on each training family, which the high level first imitates.
+"""A scripted expert on each training family, which the high policy first imitates.
 
-It is told what the high level has to find out from its cues: where on the tile the robot is and how
-fast, the way around the pillars, the lines of the trenches. How a family wants to be walked was
+It is told what the high policy has to find out from its cues: where on the tile the robot is and
+how fast, the way around the pillars, the lines of the trenches. How a family wants to be walked was
 tried on training tiles (docs/experiments.md). Leaps over trenches show why imitation comes first:
 pronk at nearly full speed, its steps timed to a few centimetres, is nothing that exploring from a
 trot finds.

@@ -1,4 +1,4 @@
-"""The tiles that both levels train on: every robot has one of its own, of its family and level.
+"""The tiles that both policies train on: every robot has one of its own, of its family and level.
 
 A tile follows from the seed and its number, so a checkpoint holds numbers instead of heights.
 """
