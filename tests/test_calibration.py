@@ -127,13 +127,13 @@ def test_a_range_of_one_point_is_no_division_by_zero() -> None:
 
 
 def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None:
-    given, reached = measure(low, 8, seed=5)
-    assert len(given) == len(reached) <= 8 and reached.shape[1] == 3
+    given, reached = measure(low, 24, seed=5)
+    assert len(given) == len(reached) <= 24 and reached.shape[1] == 3
     assert (np.abs(given[:, :3]) <= 1.4 * HALF).all() and (np.abs(given[:, :3]) > HALF).any()
     rows = {tuple(row) for row in given[:, 12:]}
     assert rows <= {tuple(gait_embedding(g)) for g in range(len(GAITS))}
     assert len(rows) >= 2
-    twice = measure(low, 8, seed=5)
+    twice = measure(low, 24, seed=5)
     assert (twice[0] == given).all() and (twice[1] == reached).all()
 
 

@@ -284,7 +284,7 @@ def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, cap
     assert {row["policy"] for row in rows_of(tmp_path / "out")} == {"gp"}
     capsys.readouterr()
     assert evaluate.main(["--policies", "tdgc"]) == 2
-    message = "no high policy is shipped; give one with --high, or use --policies gp"
+    message = "no high policy is shipped: give one with --high, or --policies gp"
     assert capsys.readouterr().err == f"evaluate.py: {message}\n"
 
 

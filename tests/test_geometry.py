@@ -16,7 +16,7 @@ import train_low
 from tdgc.config import ConfigError, LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.export import Pose
 from tdgc.sim.commands import INDEX, default_command
-from tdgc.sim.gaits import PhaseClock, swing_profile
+from tdgc.sim.gaits import PhaseClock, foot_phases, swing_profile
 from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
 from tdgc.sim.robot import (
     commanded_pose,
@@ -24,6 +24,7 @@ from tdgc.sim.robot import (
     leg_angles,
     nominal_pose,
     rotation_matrix,
+    walking_pose,
 )
 from tdgc.sim.world import World
 from tdgc.tasks import rewards
@@ -241,6 +242,7 @@ def test_trunk_with_turned_inertia(a1: RobotConfig) -> None:
 
 def test_a_robot_with_fixed_links_stands_on_its_feet(a1: RobotConfig) -> None:
     """All its weight, that of its feet and shoulders among it, is on its feet."""
+    a1 = dataclasses.replace(a1, commanded_gait=False)
     task = LowLevelTask(LowLevelConfig(robot=a1), 1, seed=0, training=False)
     task.reset(np.arange(1))
     for _ in range(100):
@@ -295,6 +297,7 @@ def test_payload_is_on_top_of_its_own_trunk(robot: RobotConfig) -> None:
 
 def test_another_robot_stands_at_the_commanded_height(robot: RobotConfig) -> None:
     """On zero actions it stands on its feet at its base height, and 3 cm lower when told to."""
+    robot = dataclasses.replace(robot, commanded_gait=False)
     task = LowLevelTask(LowLevelConfig(robot=robot), 2, seed=0, training=False)
     task.reset(np.arange(2))
     state = task.locomotion.world.state
@@ -327,10 +330,18 @@ def test_commanded_and_exported_pose_of_another_robot(robot: RobotConfig) -> Non
     rest, _ = foot_kinematics(geometry, nominal_pose(robot)[None], STILL)
     moved = np.broadcast_to(-command[:, INDEX["body_height"], None], (20, 4))
     np.testing.assert_allclose((feet - rest)[..., 2], moved, atol=1e-9)
-    graph = Pose(robot)
-    for k in range(20):
-        given = th.from_numpy(clock.clock[k : k + 1]), th.ones(()), th.from_numpy(command[k])
-        np.testing.assert_allclose(graph(*given).numpy(), pose[k], atol=1e-6)
+    frequency, duty = command[:, INDEX["frequency"]], command[:, INDEX["duration"]]
+    now, ahead = (
+        foot_phases((clock.clock + time * frequency) % 1.0, command[:, 12:], duty)
+        for time in (0.01, 0.01 + robot.kd / robot.kp)
+    )
+    walking = walking_pose(robot, geometry, command, now, ahead, np.ones(20))
+    assert np.abs(walking - pose).max() > 0.1  # the weight of 15 kg on stiffer joints
+    for gait, wanted in ((False, pose), (True, walking)):
+        graph = Pose(dataclasses.replace(robot, commanded_gait=gait), 0.02)
+        for k in range(20):
+            given = th.from_numpy(clock.clock[k : k + 1]), th.ones(()), th.from_numpy(command[k])
+            np.testing.assert_allclose(graph(*given).numpy(), wanted[k], atol=1e-6)
 
 
 def test_rewards_know_another_robots_limits(robot: RobotConfig) -> None:

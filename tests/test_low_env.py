@@ -195,7 +195,8 @@ def test_reset_gives_a_fresh_observation() -> None:
 
 def test_reward_of_a_step_is_that_of_its_terms() -> None:
     task = begin(PLANE, 2)
-    task.locomotion.command[:] = default_command()  # whose pose is the nominal one
+    task.locomotion.command[:] = default_command()
+    pose = task.locomotion.pose().copy()
     before = task.locomotion.world.state.qd.copy()
     actions = np.random.default_rng(0).normal(size=(2, 12))
     reward, _, _ = task.step(actions)
@@ -207,7 +208,7 @@ def test_reward_of_a_step_is_that_of_its_terms() -> None:
     expected = weights.joint_accelerations * (change**2).sum()
     assert terms["joint_accelerations"] == pytest.approx(expected)
     assert terms["action_rate"] == pytest.approx(weights.action_rate * (actions**2).sum())
-    moved = actions * np.tile([0.125, 0.25, 0.25], 4)
+    moved = pose + actions * np.tile([0.125, 0.25, 0.25], 4) - nominal_pose(PLANE.robot)
     assert terms["target_rate"] == pytest.approx(weights.target_rate * (moved**2).sum())
     assert terms["joint_torques"] == pytest.approx(weights.joint_torques * (state.torque**2).sum())
     assert stats["reward"] == pytest.approx(reward.sum())

@@ -34,7 +34,8 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.tasks.high_env import PRETRAINED, load_low
 
-HIGH, LOW = HighLevelConfig(), LowLevelConfig()
+LOW = LowLevelConfig()
+HIGH = HighLevelConfig(commands=LOW.commands)
 
 
 @pytest.fixture(scope="module")
