@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch as th
@@ -20,7 +22,14 @@ from tqdm import tqdm
 
 from tdgc import __version__, policies
 from tdgc.calibration import calibrate
-from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, to_dict
+from tdgc.config import (
+    ConfigError,
+    LowLevelConfig,
+    LowTrainConfig,
+    RobotConfig,
+    to_dict,
+    with_overrides,
+)
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.ppo import NoiseScaledRate, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
@@ -30,6 +39,7 @@ from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.show import plots
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
+from tdgc.sim.robot import fitted
 from tdgc.sim.terrain import EDITION
 from tdgc.sim.world import check_robot
 from tdgc.tasks.low_env import make_task
@@ -54,6 +64,24 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
     tiles = dataclasses.replace(env, terrain="tiles")
     make = functools.partial(build, config, (plane, tiles), device)
     return [Phase("learning to walk", make, config.steps)]
+
+
+def fit(config: LowTrainConfig, assignments: Sequence[str]) -> LowTrainConfig:
+    """The configuration with what follows from another robot's URDF, but for what was assigned.
+
+    Raises:
+        ConfigError: a URDF that does not fit.
+    """
+    if config.env.robot.urdf == RobotConfig().urdf:
+        return config
+    assigned = {text.partition("=")[0].strip() for text in assignments}
+    found = [
+        f"env.robot.{name}={json.dumps(value)}"
+        for name, value in fitted(config.env.robot).items()
+        if f"env.robot.{name}" not in assigned
+    ]
+    tqdm.write(f"from {config.env.robot.urdf}: {' '.join(found)}")
+    return with_overrides(config, found)
 
 
 class StoppedError(Exception):
@@ -138,6 +166,8 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     try:
         config = configure(LowTrainConfig(), args)
+        if not args.resume:
+            config = fit(config, args.assignments)
         check_families(config.env.families)
         check_robot(config.env.robot, config.env.physics)
         meta = {

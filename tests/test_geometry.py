@@ -20,6 +20,7 @@ from tdgc.sim.gaits import PhaseClock, foot_phases, swing_profile
 from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
 from tdgc.sim.robot import (
     commanded_pose,
+    fitted,
     foot_kinematics,
     leg_angles,
     nominal_pose,
@@ -90,6 +91,31 @@ def changed(folder: Path, *changes: tuple[str, str]) -> RobotConfig:
         text = text.replace(old, new)
     path.write_text(text, encoding="utf-8")
     return RobotConfig(urdf=str(path))
+
+
+# ------------------------------------------------------------------ what follows from it
+
+
+def test_the_shipped_robots_settings_fit_itself() -> None:
+    ours = RobotConfig()
+    assert fitted(ours) == {name: getattr(ours, name) for name in fitted(ours)}
+
+
+def test_settings_for_another_robot(a1: RobotConfig, robot: RobotConfig) -> None:
+    """A1: 12.458 of 12.6 kg, legs of 0.4 of 0.426 m, and what its URDF says of its motors."""
+    found = fitted(a1)
+    assert found == {
+        "base_height": 0.28, "kp": 18.6, "kd": 0.54,
+        "torque_limit": (20.0, 55.0, 55.0), "speed_limit": (52.4, 28.6, 28.6),
+    }  # fmt: skip
+    assert fitted(robot)["kp"] == pytest.approx(20.0 * 15.4 / 12.6 * 0.5 / 0.426, abs=0.05)
+
+
+def test_a_urdf_that_says_nothing_of_its_motors(tmp_path: Path) -> None:
+    silent = changed(tmp_path, (' effort="23.7" velocity="30"', ""))
+    assert set(fitted(silent)) == {"base_height", "kp", "kd"}
+    with pytest.raises(ConfigError, match=r"limit effort must be at least 0, not -1$"):
+        fitted(changed(tmp_path, ('effort="35.5"', 'effort="-1"')))
 
 
 # ------------------------------------------------------------------ what is read

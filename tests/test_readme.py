@@ -136,8 +136,9 @@ CHAINS: tuple[dict[str, Run], ...] = (
         ),
     },
     {
-        "python train_low.py --set env.robot.urdf=a1/a1.urdf --set env.robot.base_height=0.27 "
-        "--out runs/a1_low": Run(LOW, ("runs/a1_low/policy.safetensors",)),
+        "python train_low.py --set env.robot.urdf=a1/a1.urdf --out runs/a1_low": Run(
+            LOW, ("runs/a1_low/policy.safetensors",)
+        ),
         "python train_high.py --low runs/a1_low/policy --out runs/a1_high": Run(
             HIGH, ("runs/a1_high/policy.safetensors",)
         ),

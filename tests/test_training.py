@@ -618,6 +618,22 @@ def test_the_low_policy_is_what_the_first_command_left(
     assert train_high.find_low() == "runs/low/policy"
 
 
+def test_a_run_with_another_robot_takes_what_fits_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """But what was assigned; the shipped robot's settings stay as they are."""
+    urdf = tmp_path / "heavy.urdf"
+    shipped = (ROOT / "urdf" / "quadruped.urdf").read_text(encoding="utf-8")
+    urdf.write_text(shipped.replace('<mass value="5.6"/>', '<mass value="11.9"/>'))
+    assigned = [f"env.robot.urdf={urdf}", "env.robot.kd=0.7"]
+    config = train_low.fit(with_overrides(LowTrainConfig(), assigned), assigned)
+    robot = config.env.robot
+    assert (robot.kp, robot.kd, robot.base_height) == (30.0, 0.7, 0.3)  # 18.9 instead of 12.6 kg
+    assert robot.torque_limit == (23.7, 23.7, 35.5)
+    assert "env.robot.kp=30.0" in "".join(capsys.readouterr())
+    assert train_low.fit(LowTrainConfig(), ["env.robot.kp=25"]) == LowTrainConfig()
+
+
 def test_robots_of_a_run() -> None:
     """Some on a plane, whose physics step is as long as a torque is held, the others on tiles."""
     config = with_overrides(LowTrainConfig(), ["steps=80"])

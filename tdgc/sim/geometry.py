@@ -52,6 +52,8 @@ class Geometry:
         trunk_mass: kg, without what is fixed to the trunk by joints.
         masses: kg of each link, by name.
         joint_limits: lowest and highest angle of each joint, (12, 2) rad.
+        motor_limits: torque in N m and speed in rad/s of hip, thigh and calf, (2, 3), the least of
+            the four legs; infinite where the URDF says nothing.
     """
 
     hips: Array
@@ -62,6 +64,7 @@ class Geometry:
     trunk_mass: float
     masses: dict[str, float]
     joint_limits: Array
+    motor_limits: Array
 
 
 def urdf_path(config: RobotConfig) -> Path:
@@ -143,6 +146,11 @@ def _measure(robot: Element) -> Geometry:
         trunk_mass=_mass(parts[_link_of(joints["FL_hip_joint"], "parent")][0].link),
         masses={p.link.get("name", ""): _mass(p.link) for own in parts.values() for p in own},
         joint_limits=limits.reshape(len(JOINTS), 2),
+        motor_limits=np.stack(
+            [[_motor_limit(joints[name], key) for name in JOINTS] for key in ("effort", "velocity")]
+        )
+        .reshape(2, 4, 3)
+        .min(axis=1),
     )
 
 
@@ -256,6 +264,14 @@ def _limits(joint: Element) -> Array:
     if "calf" in joint.get("name", "") and not low < 0.0:
         raise ConfigError(f"{_called(joint)}: a knee bends to negative angles, lower < 0")
     return np.array([low, high])
+
+
+def _motor_limit(joint: Element, key: str) -> float:
+    """Torque (``effort``) or speed (``velocity``) that a joint's motor ends at; 0 means none."""
+    value = float(_numbers(joint, "limit", key, "0", 1)[0])
+    if value < 0.0:
+        raise ConfigError(f"{_called(joint)}: limit {key} must be at least 0, not {value:g}")
+    return value or np.inf
 
 
 def _foot(parts: list[_Part]) -> Array:

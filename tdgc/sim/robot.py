@@ -8,6 +8,7 @@ Every array has a leading axis of M robots. Legs in the order of ``tdgc.sim.gait
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from tdgc.config import RobotConfig
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import swing_profile
-from tdgc.sim.geometry import FRONT, JOINTS, SIDE, Geometry
+from tdgc.sim.geometry import FRONT, JOINTS, SIDE, Geometry, read_geometry
 
 Array = NDArray[np.float64]
 
@@ -36,6 +37,29 @@ def nominal_height(config: RobotConfig, geometry: Geometry) -> float:
     """Trunk above the soles in the nominal pose, m."""
     feet, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
     return float(geometry.foot_radius - feet[0, :, 2].min())
+
+
+def fitted(config: RobotConfig) -> dict[str, Any]:
+    """Settings for the robot whose URDF ``config`` names, by field: what the URDF says of its
+    motors, and what follows from the shipped robot's settings for one of its size and mass.
+
+    It stands at the same share of its nominal pose's height. Gains grow as its weight's torque
+    about the joints, m g l, and damping for the same damping ratio, as m l^1.5.
+    """
+    ours, own = RobotConfig(), read_geometry(config)
+    shipped = read_geometry(ours)
+    mass = sum(own.masses.values()) / sum(shipped.masses.values())
+    length = (own.thigh + own.calf) / (shipped.thigh + shipped.calf)
+    height = nominal_height(config, own) / nominal_height(ours, shipped)
+    found: dict[str, Any] = {
+        "base_height": round(height * ours.base_height, 2),
+        "kp": round(mass * length * ours.kp, 1),
+        "kd": round(mass * length**1.5 * ours.kd, 2),
+    }
+    for name, limits in zip(("torque_limit", "speed_limit"), own.motor_limits, strict=True):
+        if np.isfinite(limits).all():
+            found[name] = tuple(limits.tolist())
+    return found
 
 
 def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swing: Array) -> Array:
