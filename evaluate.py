@@ -10,8 +10,6 @@ python evaluate.py --gui watch --families stair --levels 6
 python evaluate.py --set decoder.vx.high=0.6 --set safety.max_tilt=0.5
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json
@@ -27,32 +25,24 @@ from tdgc.benchmark import diagnosis, tuning
 from tdgc.benchmark.cues import CuesLaw
 from tdgc.benchmark.diagnosis import Diagnosis, diagnose
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
-from tdgc.benchmark.evaluation import (
-    CONDITIONS,
-    Cell,
-    Episode,
-    Spread,
-    Watcher,
-    low_config,
-    plan,
-    run_cell,
-    spread,
-)
-from tdgc.benchmark.flags import choose, choose_levels
-from tdgc.benchmark.recording import Recorder, Recording, Together
+from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, Watcher, low_config, plan, run_cell
+from tdgc.benchmark.flags import add_arguments, choose, read
+from tdgc.benchmark.recording import Recorder, Recording
 from tdgc.benchmark.results import describe, write_results
-from tdgc.benchmark.trace import Selection, Trace, Tracer, check_installed, write
+from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
+from tdgc.errors import require
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
-from tdgc.parallel.cores import usable_cores, workers_flag
+from tdgc.parallel.cores import usable_cores
+from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Policy, load
 from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
-from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, height_map, is_map
+from tdgc.sim.terrain import ALL_FAMILIES
 from tdgc.sim.world import WindowError
 from tdgc.tasks.high_env import PRETRAINED, load_low
 from tdgc.tasks.leaps import measure_landing
@@ -68,13 +58,7 @@ SHIPPED_HIGH = PRETRAINED / "high"
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
-    parser.add_argument(
-        "--families",
-        default="all",
-        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING}",
-    )
-    parser.add_argument("--episodes", type=int, default=100, help="a cell (100)")
+    add_arguments(parser, "runs/evaluation")
     parser.add_argument(
         "--policies",
         help="all, or of tdgc (the hierarchy), gp (the scripted baseline), cues (a script on the "
@@ -104,15 +88,6 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         help="change the tuning, e.g. decoder.vx.high=0.6; may be repeated",
     )
     parser.add_argument(
-        "--video",
-        type=int,
-        nargs="?",
-        const=1,
-        default=0,
-        metavar="N",
-        help="films, sheets and strips of the first N episodes of each cell (1)",
-    )
-    parser.add_argument(
         "--gui",
         nargs="?",
         const="drive",
@@ -120,12 +95,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         help="Bullet's window instead of a table, on the first tile of the first family and level: "
         "drive the low policy with sliders (drive), or watch the first policy decide (watch)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
-    parser.add_argument(
-        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
-    )
     parser.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
-    parser.add_argument("--out", type=Path, default=Path("runs/evaluation"), help="results folder")
     return parser.parse_args(arguments)
 
 
@@ -167,17 +137,8 @@ class Evaluation:
     out: Path
 
     def __post_init__(self) -> None:
-        for flag, value in (("--episodes", self.episodes), ("--workers", self.workers)):
-            if value < 1:
-                raise ValueError(f"{flag} must be at least 1, not {value}")
-        if not 0 <= self.seed < 2**32:
-            raise ValueError(f"--seed must lie in [0, 2**32), not {self.seed}")
-        if not 0 <= self.filmed <= self.episodes:
-            raise ValueError(f"--video must lie in [0, --episodes], not {self.filmed}")
         if self.traced is not None:
-            check_installed()
-        for name in filter(is_map, self.families):
-            height_map(name)
+            require("a trace", ("pyarrow",), "trace")
         if "tdgc" in self.policies and self.high is None and self.mode != "tracking":
             raise ValueError("no high policy is shipped: give one with --high, or --policies gp")
         self._check_mode()
@@ -210,7 +171,7 @@ class Evaluation:
             raise ValueError(f"the {TEACHER} is told the family; it cannot lead in {hidden[0]}")
 
     @classmethod
-    def of(cls, flags: argparse.Namespace) -> Evaluation:
+    def of(cls, flags: argparse.Namespace) -> "Evaluation":
         """What the flags ask for.
 
         Raises:
@@ -221,15 +182,16 @@ class Evaluation:
             raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
         shipped = SHIPPED_HIGH if SHIPPED_HIGH.with_suffix(".json").is_file() else None
         high = flags.high or shipped
-        maps = tuple(name for name in flags.families.split(",") if is_map(name))
+        automatic = flags.workers == "auto"
+        read(flags)
         asked = flags.policies or ("gp" if high is None else "all")
         tuned = flags.tune is not None or flags.assignments
         evaluation = cls(
             mode=flags.gui or ("tracking" if flags.tracking else "table"),
             policies=choose(asked, ALL_POLICIES, POLICIES, "policy"),
             conditions=choose(flags.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition"),
-            families=choose(flags.families, (*ALL_FAMILIES, *maps), FAMILIES, "family"),
-            levels=choose_levels(flags.levels),
+            families=flags.families,
+            levels=flags.levels,
             episodes=flags.episodes,
             low=flags.low,
             high=high,
@@ -238,18 +200,18 @@ class Evaluation:
             traced=Selection.parse(flags.trace) if flags.trace is not None else None,
             filmed=flags.video,
             cluster=flags.cluster,
-            workers=usable_cores() if flags.workers == "auto" else flags.workers,
+            workers=flags.workers,
             out=flags.out,
         )
         if flags.cluster is None:
             return evaluation
         cores = cluster.connect(flags.cluster)  # only for what can be evaluated
-        return replace(evaluation, workers=cores) if flags.workers == "auto" else evaluation
+        return replace(evaluation, workers=cores) if automatic else evaluation
 
     @property
-    def spread(self) -> Spread:
-        """What shares jobs out."""
-        return spread if self.cluster is None else cluster.spread
+    def run_jobs(self) -> RunJobs:
+        """What shares jobs among processes, here or in the cluster."""
+        return run_jobs if self.cluster is None else cluster.run_jobs
 
     def drivers(self, low: Policy, config: LowLevelConfig) -> dict[str, Driver]:
         """What drives the robots under each policy, and under the tuned one after ``tdgc``.
@@ -320,8 +282,8 @@ def run_one(
     """Run a batch. It writes nothing: it may run on another machine."""
     driver = drivers[cell.policy]
     recorder, tracer = Recorder(driver, seed, filmed), Tracer(driver, seed)
-    watcher: Watcher = recorder if traced is None else Together([tracer, recorder])
-    episodes = run_cell(cell, low, driver, seed, watcher)
+    watchers: list[Watcher] = [recorder] if traced is None else [tracer, recorder]
+    episodes = run_cell(cell, low, driver, seed, watchers)
     traces = [] if traced is None else tracer.traces()
     hips = float(read_geometry(low_config(low).robot).hips[0, 0])
     return Ran(
@@ -343,7 +305,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     recordings: list[Recording] = []
     diagnoses: list[Diagnosis] = []
     with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
-        for ran in e.spread(work, cells, e.workers):
+        for ran in e.run_jobs(work, cells, e.workers):
             for trace in ran.traces:
                 write(trace, out / "traces")
             episodes += ran.episodes
@@ -399,7 +361,7 @@ def print_effect(effect: dict[str, Any]) -> None:
 def run_tracking(evaluation: Evaluation, low: Policy) -> None:
     """Measure the low policy alone, print what is found and write tracking.json."""
     e = evaluation
-    result = tracking(low, e.episodes, e.seed, e.workers, e.spread)
+    result = tracking(low, e.episodes, e.seed, e.workers, e.run_jobs)
     (e.out / "tracking.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
     print("gait    velocity RMSE  yaw rate RMSE  contact match")
     for gait, r in result["gaits"].items():

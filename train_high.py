@@ -7,8 +7,6 @@ python train_high.py --init tdgc/pretrained/high --set env.commands.vx=[-1,0.8]
 python train_high.py --resume --out runs/high
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools
@@ -150,7 +148,8 @@ def build_imitation(
     env = make_env(config, low, imitation.steps // config.n_envs, timeout, link)
     model = make_learner(
         Apprentice, ApprenticePolicy, env, config, device,
-        learning_rate=imitation.learning_rate, n_epochs=imitation.n_epochs,
+        learning_rate=LinearRate(imitation.learning_rate, imitation.final_learning_rate),
+        n_epochs=imitation.n_epochs,
     )  # fmt: skip
     return model, env
 
@@ -224,7 +223,7 @@ def main(arguments: list[str] | None = None) -> int:
         check_families(config.env.families)
         check(config)
         if config.imitation.steps:
-            for family in config.env.families:
+            for family in dict.fromkeys(config.env.families):
                 if family not in STYLES:
                     tqdm.write(f"the teacher knows no style for {family} and walks straight on")
         meta: dict[str, Any] = {

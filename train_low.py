@@ -6,8 +6,6 @@ python train_low.py --time-limit 3600      an hour of it
 python train_low.py --resume --out runs/low
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools
@@ -146,7 +144,7 @@ def build(
         batch_size=ppo.batch_size,
         **shared_keywords(ppo),
         policy_kwargs={
-            "actor_dim": width(actor_layout(config.env.gyro)),
+            "actor_dim": width(actor_layout(config.env.robot, config.env.gyro)),
             "mirror": low_mirror(config.env) if ppo.mirror else None,
             "net_arch": {"pi": list(ppo.actor), "vf": list(ppo.critic)},
             "optimizer_kwargs": {"eps": ppo.adam_eps},

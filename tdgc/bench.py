@@ -14,8 +14,6 @@ networks by sb3-contrib's own pass and by the fast one; the table is in ``update
 turn; the table is in ``cluster.json``.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json
@@ -127,7 +125,7 @@ def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
         observed,
         acted,
         lambda _: ppo.learning_rate,
-        actor_dim=width(actor_layout(config.env.gyro)),
+        actor_dim=width(actor_layout(config.env.robot, config.env.gyro)),
         mirror=low_mirror(config.env) if ppo.mirror else None,
         net_arch={"pi": list(ppo.actor), "vf": list(ppo.critic)},
         activation_fn=ACTIVATIONS[ppo.activation],

@@ -9,44 +9,33 @@ velocity each of them leads to, and a copy of the policy learns, in the training
 command what the policy does at the command that leads there. What goes in and out of it stays.
 """
 
-from __future__ import annotations
-
 import argparse
 import copy
 import dataclasses
 import functools
 import itertools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch import nn
 
 from tdgc import policies
-from tdgc.benchmark.evaluation import spread
 from tdgc.benchmark.tracking import draw_commands, walk_on_plane
 from tdgc.config import CalibrationConfig, CommandRanges, LowLevelConfig
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
-from tdgc.parallel.group import TaskGroup
-from tdgc.parallel.vec import TaskVecEnv
-from tdgc.parallel.worker import Task, WorkerError
+from tdgc.parallel.jobs import run_jobs
+from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Actor, Policy
-from tdgc.sim.commands import (
-    CONTINUOUS,
-    NAMES,
-    NUM_COMMANDS,
-    SIDEWAYS,
-    commands_of,
-    observed_command,
-)
+from tdgc.sim.commands import CONTINUOUS, NAMES, NUM_COMMANDS, SIDEWAYS, observed_command
 from tdgc.sim.gaits import GAITS
-from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import columns
-from tdgc.sim.robot import Array
+from tdgc.sim.robot import Array, action_scale
 from tdgc.tasks.high_env import load_low
-from tdgc.tasks.low_env import LowLevelTask, make_task
+from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.rules import is_fallen
 
 #: From the commands asked for to those given, (n, 15) -> (n, 15).
@@ -73,7 +62,6 @@ _RATE = 3e-4  # of Adam, falling to nothing
 _WALKING, _FITTED = 0.3, 0.4  # about the shares of the time that are over after walking and fitting
 
 _SIGN = np.where(np.isin(NAMES, SIDEWAYS), -1.0, 1.0)  # of commands in a left-right mirror
-_COMMAND = columns(actor_layout(gyro=False))["command"]  # in an observation
 
 
 # ------------------------------------------------------------------ what a command leads to
@@ -214,23 +202,43 @@ class Corrector:
 # ------------------------------------------------------------------ the copy
 
 
-def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> Task:
+def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> list[LowLevelTask]:
     """The training MDP as it is late in a run: all commands, all levels, most robots on a plane."""
     config = dataclasses.replace(config, command_start=1.0)
-    plane, tiles = (dataclasses.replace(config, terrain=terrain) for terrain in ("plane", "tiles"))
-    group = make_task((plane, tiles), _PLANE_SHARE, robots, seed)
-    assert isinstance(group, TaskGroup)
-    rugged = group.tasks[1]
-    assert isinstance(rugged, LowLevelTask)
+    on_plane = round(_PLANE_SHARE * robots)
+    seeds = np.random.SeedSequence(seed).generate_state(2).tolist()
+    plane = LowLevelTask(dataclasses.replace(config, terrain="plane"), on_plane, seeds[0])
+    tiles = dataclasses.replace(config, terrain="tiles")
+    rugged = LowLevelTask(tiles, robots - on_plane, seeds[1])
     rugged.level[:] = np.arange(rugged.num_robots) % config.levels
-    return group
+    return [plane, rugged]
+
+
+def shown(
+    low: Policy, correct: Correction, task: LowLevelTask
+) -> tuple[NDArray[np.float32], Array]:
+    """What the actor sees of a task's robots, (M, n), and the actions at which their joint targets
+    are those of ``low`` at corrected commands, (M, 12)."""
+    loco = task.locomotion
+    x = task.observe()[:, : low.actor_dim]
+    asked, pose = loco.command, loco.pose()
+    loco.command = asked.copy()
+    loco.command[:, :3] = correct(loco.executed())[:, :3]
+    change = loco.pose() - pose
+    given, where = x.copy(), columns(loco.layout)
+    given[:, where["command"]] = observed_command(loco.executed())
+    given[:, where["joint_error"]] -= change
+    if "pose" in where:
+        given[:, where["pose"]] += change
+    loco.command = asked
+    return x, low.predict(given)[0] + change / action_scale(loco.robot)
 
 
 @policies.one_thread()
 def distil(
     low: Policy,
     correct: Correction,
-    env: TaskVecEnv,
+    tasks: Sequence[LowLevelTask],
     turns: int,
     seed: int,
     tick: Callable[[float], None] = lambda share: None,
@@ -248,19 +256,19 @@ def distil(
     optimiser = th.optim.Adam(student.parameters(), lr=_RATE)
     seen: list[tuple[th.Tensor, th.Tensor]] = []
     first = last = 0.0
-    obs = env.reset()
+    for task in tasks:
+        task.reset(np.arange(task.num_robots))
     for turn in range(turns):
-        states = []
+        lessons = []
         for _ in range(_TURN):
-            states.append(obs[:, : low.actor_dim])
-            with th.inference_mode():
-                actions = student(th.from_numpy(states[-1])).numpy()
-            env.step_async(np.clip(actions, low.low, low.high))
-            obs = env.step_wait()[0]
-        x = np.concatenate(states)
-        given = x.copy()
-        given[:, _COMMAND] = observed_command(correct(commands_of(x[:, _COMMAND])))
-        state, wanted = th.from_numpy(x), th.from_numpy(low.predict(given)[0])
+            for task in tasks:
+                state, wanted = (_float32(part) for part in shown(low, correct, task))
+                with th.inference_mode():
+                    actions = student(state).numpy()
+                _, terminated, truncated = task.step(np.clip(actions, low.low, low.high))
+                task.reset(np.flatnonzero(terminated | truncated))
+                lessons.append((state, wanted))
+        state, wanted = (th.cat(parts) for parts in zip(*lessons, strict=True))
         with th.inference_mode():
             last = float((student(state) - wanted).square().mean().sqrt())
         first = first if turn else last
@@ -275,6 +283,10 @@ def distil(
             optimiser.step()
         tick((turn + 1) / turns)
     return student, first, last
+
+
+def _float32(x: NDArray[np.floating]) -> th.Tensor:
+    return th.from_numpy(x.astype(np.float32))
 
 
 # ------------------------------------------------------------------ the script
@@ -292,7 +304,7 @@ def calibrate(
     Args:
         low: the policy.
         calibration: how thoroughly.
-        workers: processes.
+        workers: processes that robots walk in.
         seed: of everything random here.
         tick: told now and then which share of the work is done; what it raises ends the work.
 
@@ -307,24 +319,21 @@ def calibrate(
     counts = [min(_BATCH, robots - first) for first in range(0, robots, _BATCH)]
     jobs = [(count, seed * len(counts) + k) for k, count in enumerate(counts)]
     walks = []
-    for walk in spread(functools.partial(_walk, low), jobs, workers):
+    for walk in run_jobs(functools.partial(_walk, low), jobs, workers):
         walks.append(walk)
         tick(_WALKING * len(walks) / len(jobs))
     given, reached = (np.concatenate(parts) for parts in zip(*walks, strict=True))
     response = ResponseModel(given, reached, config.commands, seed)
     correct = Corrector(response, seed)
     tick(_FITTED)
-    probe = LowLevelTask(dataclasses.replace(config, terrain="plane"), 1, seed=0)
-    spaces = probe.observation_space, probe.action_space
-    probe.close()
-    tasks = functools.partial(training_tasks, config)
-    env = TaskVecEnv(tasks, _ROBOTS, workers, seed, spaces, recover=True)
+    tasks = training_tasks(config, _ROBOTS, seed)
     try:
         student, first, last = distil(
-            low, correct, env, turns, seed, lambda done: tick(_FITTED + (1.0 - _FITTED) * done)
+            low, correct, tasks, turns, seed, lambda done: tick(_FITTED + (1.0 - _FITTED) * done)
         )
     finally:
-        env.close()
+        for task in tasks:
+            task.close()
     vx, vy, yaw_rate = response.error.tolist()
     return student, {
         "robots": robots, "turns": turns, "seed": seed, "walked": len(given),

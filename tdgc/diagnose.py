@@ -6,8 +6,6 @@ Prints the diagnosis and writes the trace. What only a simulator knows is missin
 say what it is.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path
@@ -15,7 +13,7 @@ from pathlib import Path
 from tdgc.benchmark import diagnosis, trace
 from tdgc.deploy import log
 from tdgc.deploy.controller import Controller
-from tdgc.deploy.interface import require
+from tdgc.errors import require
 from tdgc.sim.geometry import read_geometry
 
 
@@ -30,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     try:
         require("a log's diagnosis", ("jsonschema", "onnxruntime"), "mujoco")
-        trace.check_installed()
+        require("a trace", ("pyarrow",), "trace")
         controller = Controller(args.export)
         geometry = read_geometry(controller.robot())
         found = log.read(args.log, controller)

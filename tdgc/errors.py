@@ -1,11 +1,6 @@
 """What all errors about something that was read have in common: their message is one line."""
 
-from __future__ import annotations
-
-
-def install_hint(extra: str) -> str:
-    """What to do where the packages of an optional extra are missing."""
-    return f"install the extra '{extra}', pip install -c constraints.txt -e '.[{extra}]'"
+import importlib.util
 
 
 class InputError(ValueError):
@@ -17,3 +12,17 @@ class InputError(ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
+
+
+def require(what: str, packages: tuple[str, ...], extra: str) -> None:
+    """Refuse to do ``what`` without the packages of an optional extra that it needs.
+
+    Raises:
+        InputError: names those that are missing and what to install.
+    """
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"{what} needs {', '.join(missing)}: install the extra '{extra}', "
+            f"pip install -c constraints.txt -e '.[{extra}]'"
+        )

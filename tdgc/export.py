@@ -9,11 +9,7 @@ unit, and how the joints are driven; likewise for ``high``, with the task. The r
 too. Afterwards each pair of graphs drives a robot in the simulator for as long as an episode, from
 the folder alone (``tdgc.deploy``), and its outputs are compared with the policies'.
 
-All inputs and outputs are vectors of float64. The networks run in float32, as they were trained;
-what surrounds them runs in float64, as in the simulator: a clock in float32 would drift away.
 """
-
-from __future__ import annotations
 
 import argparse
 import dataclasses
@@ -21,59 +17,32 @@ import json
 import shutil
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
-from numpy.typing import ArrayLike
-from torch import Tensor, nn
 
 from tdgc import __version__
 from tdgc.benchmark.drivers import HierarchyDriver, load_high
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig
 from tdgc.deploy.controller import FORMATS, Controller, quiet
-from tdgc.deploy.interface import VERSION, Table, checksum, interface_path, require
+from tdgc.deploy.graphs import HighGraph, LowGraph, Signal
+from tdgc.deploy.interface import VERSION, Table, checksum, interface_path
+from tdgc.errors import require
 from tdgc.policies import Policy
-from tdgc.sim.commands import (
-    CONTINUOUS,
-    INDEX,
-    NAMES,
-    NUM_ACTIONS,
-    NUM_COMMANDS,
-    UNITS,
-    CommandDecoder,
-    default_command,
-    observed_command,
-)
+from tdgc.sim.commands import CONTINUOUS, NAMES, UNITS, CommandDecoder, default_command
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
-from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
+from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
 from tdgc.sim.locomotion import Locomotion, actor_layout
-from tdgc.sim.observation import Term, width
-from tdgc.sim.robot import (
-    GRAVITY,
-    HIGHEST_FOOT,
-    NUM_JOINTS,
-    Array,
-    action_scale,
-    foot_kinematics,
-    nominal_height,
-    nominal_pose,
-    pd_torque,
-    target_limits,
-)
+from tdgc.sim.observation import width
+from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
 from tdgc.sim.terrain import TileField, make_tile
 from tdgc.sim.world import World
-from tdgc.tasks.high_env import (
-    GOAL_SCALE,
-    PRETRAINED,
-    SEMANTIC,
-    high_layout,
-    load_low,
-)
-from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBES
+from tdgc.tasks.high_env import PRETRAINED, SEMANTIC, load_low
+from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.rules import GOAL_RADIUS, GOING, outcome
 
 #: Largest difference allowed between graphs and policies, in the units of the outputs: float32
@@ -83,369 +52,6 @@ TOLERANCE = 1e-5
 # The extra `export` of setup.cfg; all but the first are for the format onnx.
 _PACKAGES = ("jsonschema", "onnx", "onnxruntime", "onnxscript")
 _CHECKED_ON = "rough"  # where every step differs from the one before
-
-
-# ---------------------------------------------------------------------------------------------
-# The graphs
-
-
-def _constant(value: ArrayLike) -> Tensor:
-    # A tensor, since the ONNX exporter rounds Python's floats to float32.
-    return th.tensor(np.asarray(value, dtype=np.float64))
-
-
-_TURN = _constant(2.0 * np.pi)
-
-
-class Row:
-    """Rows of a network's inputs, in the order and scales of ``layout``."""
-
-    def __init__(self, layout: Sequence[Term[Any]]) -> None:
-        self._terms = [(term.name, _constant(term.scale)) for term in layout]
-
-    def __call__(self, terms: Mapping[str, Tensor]) -> Tensor:
-        """Terms by name, in the units that they are read in -> (n,) float32."""
-        return th.cat([scale * terms[name] for name, scale in self._terms]).float()
-
-
-@dataclass(frozen=True)
-class Signal:
-    """An input or output of a graph: a vector of float64.
-
-    Attributes:
-        name: as in the graph.
-        size: length of the vector.
-        unit: of its entries; None where the table ``order`` gives each entry's.
-        meaning: what it is.
-        order: the table in the interface file that names the entries.
-        previous: of an input, the input or output whose value of the step before it takes.
-        start: of an input, what it (or each entry) is in the first step of an episode.
-        source: of an input, the output of the other graph whose latest value it takes.
-    """
-
-    name: str
-    size: int
-    unit: str | None
-    meaning: str
-    order: str | None = None
-    previous: str | None = None
-    start: float | tuple[float, ...] | None = None
-    source: str | None = None
-
-
-_BODY = (
-    Signal("gravity", 3, "1", "unit vector of gravity in the trunk's frame: ahead, left, up"),
-    Signal("joint_angles", NUM_JOINTS, "rad", "measured angles", "joints"),
-    Signal("joint_speeds", NUM_JOINTS, "rad/s", "measured speeds", "joints"),
-)
-_GYRO = Signal("gyro", 3, "rad/s", "angular velocity about the trunk's axes: ahead, left, up")
-
-
-class ClippedActor(nn.Module):
-    """The mean action of a policy as ``Policy.predict`` clips it, after the LSTM if any."""
-
-    def __init__(self, policy: Policy) -> None:
-        super().__init__()
-        self.actor = policy.actor
-        self.low, self.high = th.from_numpy(policy.low), th.from_numpy(policy.high)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """What the policy's ``actor`` takes for one robot -> (action_dim,), both float32."""
-        return th.as_tensor(self.actor(x)[0]).clamp(self.low, self.high)
-
-
-def foot_phases(clock: Tensor, command: Tensor) -> Tensor:
-    """Warped phase of each foot, as ``gaits.foot_phases``: (1,), (15,) -> (4,)."""
-    phase, offset, bound = command[12:].unbind()
-    duty = command[INDEX["duration"]]
-    raw = clock + th.stack([phase + offset + bound, offset, bound, phase])
-    raw = raw - raw.floor()
-    swing = 0.5 + (raw - duty) * (0.5 / (1.0 - duty))
-    return th.where(raw < duty, raw * (0.5 / duty), swing)
-
-
-def clock_signal(clock: Tensor, command: Tensor) -> Tensor:
-    """sin(2 pi phase) of each foot, as ``PhaseClock.signal``: (1,), (15,) -> (4,)."""
-    return th.sin(_TURN * foot_phases(clock, command))
-
-
-class Pose(nn.Module):
-    """q0, as ``Locomotion.pose``: (1,), (1,), (15,) -> (12,) rad."""
-
-    def __init__(self, robot: RobotConfig, control_dt: float) -> None:
-        super().__init__()
-        nominal = nominal_pose(robot)
-        self.follows, self.nominal = robot.commanded_pose, _constant(nominal)
-        self.walks, self.kp = robot.commanded_gait, _constant(robot.kp)
-        self.middle = _constant(0.5 * control_dt)
-        self.ahead = _constant(0.5 * control_dt + robot.kd / robot.kp)
-        geometry = read_geometry(robot)
-        self.thigh, self.calf = geometry.thigh, geometry.calf
-        standing, _ = foot_kinematics(geometry, nominal[None], np.zeros((1, NUM_JOINTS)))
-        hips = np.pad(geometry.hips, ((0, 0), (0, 1)))
-        self.feet, self.default = _constant(standing[0] - hips), _constant(default_command())
-        self.front, self.side = _constant(FRONT), _constant(SIDE)
-        self.out = _constant(geometry.abduction * SIDE)
-        self.lowest, self.highest = map(_constant, geometry.joint_limits[2::3].T)
-        self.hips = _constant(geometry.hips)
-        self.weight = _constant(GRAVITY * sum(geometry.masses.values()))
-
-    def forward(self, clock: Tensor, grown: Tensor, command: Tensor) -> Tensor:
-        """``grown``: share of the swing that is asked so far, as in ``PhaseClock.swing``."""
-        if not self.follows:
-            return self.nominal
-        if self.walks:
-            return self._walk(clock, grown, command)
-        swing = (2.0 * foot_phases(clock, command) - 1.0).clamp(0.0, 1.0)
-        raised = grown * th.sin(0.5 * _TURN * swing)
-        change = command - self.default
-        x = self.feet[:, 0] + 0.5 * change[INDEX["stance_length"]] * self.front
-        y = self.feet[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
-        z = self.feet[:, 2] - change[INDEX["body_height"]]
-        return self._angles(x, y, z + change[INDEX["swing_height"]] * raised).flatten()
-
-    def _walk(self, clock: Tensor, grown: Tensor, command: Tensor) -> Tensor:
-        """As ``robot.walking_pose``."""
-        change, frequency = command - self.default, command[INDEX["frequency"]]
-        now = foot_phases(clock + self.middle * frequency, command)
-        phases = foot_phases(clock + self.ahead * frequency, command)
-        swing = (2.0 * phases - 1.0).clamp(0.0, 1.0)
-        raised = grown * command[INDEX["swing_height"]] * th.sin(0.5 * _TURN * swing)
-        # From here on against the hips, but for what turns about the trunk.
-        x = self.feet[:, 0] + self.hips[:, 0] + 0.5 * change[INDEX["stance_length"]] * self.front
-        y = self.feet[:, 1] + self.hips[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
-        z = self.feet[:, 2] - change[INDEX["body_height"]] + raised
-        turn, duty = command[INDEX["yaw_rate"]], command[INDEX["duration"]]
-        lead = grown * ((1.0 - 2.0 * phases).abs() - 0.5) * duty / frequency
-        x, y = (
-            x + lead * (command[INDEX["vx"]] - turn * y),
-            y + lead * (command[INDEX["vy"]] + turn * x),
-        )
-        pitch, roll = command[INDEX["pitch"]], command[INDEX["roll"]]
-        x, z = th.cos(pitch) * x - th.sin(pitch) * z, th.sin(pitch) * x + th.cos(pitch) * z
-        y, z = th.cos(roll) * y + th.sin(roll) * z, th.cos(roll) * z - th.sin(roll) * y
-        q = self._angles(x - self.hips[:, 0], y - self.hips[:, 1], z)
-        peak = 0.125 * 0.5 * _TURN * self.weight / duty
-        load = peak * th.sin(_TURN * now).clamp(min=0.0)
-        return (q - load[:, None] * self._rises(q) / self.kp).flatten()
-
-    def _rises(self, q: Tensor) -> Tensor:
-        """How much feet rise per rad of each joint, as in ``robot.load_torque``: (4, 3) m/rad."""
-        hip, thigh, calf = q.unbind(1)
-        x_thigh, x_calf = self.thigh * th.sin(thigh), self.calf * th.sin(thigh + calf)
-        down = -self.thigh * th.cos(thigh) - self.calf * th.cos(thigh + calf)
-        y = self.out * th.cos(hip) - down * th.sin(hip)
-        return th.stack([y, (x_thigh + x_calf) * th.cos(hip), x_calf * th.cos(hip)], 1)
-
-    def _angles(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Joint angles of feet at (4,) m each against their hips, as ``robot.leg_angles``: (4, 3)
-        rad."""
-        z = z.clamp(max=HIGHEST_FOOT)
-        out, upper, lower = self.out, self.thigh, self.calf
-        down = (y * y + z * z - out * out).clamp(min=0.0).sqrt()
-        square = x * x + down * down
-        bend = (square - upper * upper - lower * lower) / (2.0 * upper * lower)
-        # ONNX Runtime has inverse functions of float32 alone, and no arctan2.
-        calf = (-th.acos(bend.clamp(-1.0, 1.0).float())).double()
-        calf = calf.clamp(self.lowest, self.highest)
-        lean = lower * th.sin(calf) / (upper + lower * th.cos(calf))
-        hip = th.atan(((out * z + down * y) / (out * y - down * z)).float()).double()
-        thigh = (th.atan((-x / down).float()) - th.atan(lean.float())).double()
-        return th.stack([hip, thigh, calf], 1)
-
-
-class LowLevel(nn.Module):
-    """One control step of the low policy (Sec. IV-A): sensors and commands to joint targets.
-
-    Attributes:
-        inputs, outputs: what ``forward`` takes and gives, in order.
-    """
-
-    def __init__(self, policy: Policy, config: LowLevelConfig) -> None:
-        super().__init__()
-        self.actor = ClippedActor(policy)
-        robot = config.robot
-        self.dt = _constant(config.physics.control_dt)
-        self.limit = _constant(robot.action_limit)
-        self.pose = Pose(robot, config.physics.control_dt)
-        self.row = Row(actor_layout(config.gyro))
-        self.whole = _constant(1.0)
-        ramped = robot.commanded_pose and robot.swing_ramp > 0.0
-        self.ramp = _constant(robot.swing_ramp) if ramped else None
-        hurried = robot.start_frequency > 0.0 and robot.start_cycles > 0.0
-        self.start = _constant(robot.start_cycles) if hurried else None
-        self.least = _constant(robot.start_frequency)
-        self.counted = ramped or hurried
-        self.is_frequency = _constant(np.arange(NUM_COMMANDS) == INDEX["frequency"])
-        self.joint_scale = _constant(action_scale(robot))
-        lowest, highest = target_limits(robot, read_geometry(robot))
-        self.lowest, self.highest = _constant(lowest), _constant(highest)
-        # This map is affine, so its values at 0 and at 1 say all.
-        zero = observed_command(np.zeros(NUM_COMMANDS))
-        self.command_zero = _constant(zero)
-        self.command_gain = _constant(observed_command(np.ones(NUM_COMMANDS)) - zero)
-        self.gait_shares = _constant(np.arange(len(GAITS)) / (len(GAITS) - 1))
-        self.inputs = [
-            *_BODY,
-            *([_GYRO] if config.gyro else []),
-            Signal("last_action", NUM_JOINTS, "1", "the last action", "joints", "action", 0.0),
-            Signal("action_before", NUM_JOINTS, "1", "before that", "joints", "last_action", 0.0),
-            Signal(
-                "commands",
-                NUM_COMMANDS,
-                None,
-                "to follow in this step",
-                "commands",
-                source="high.commands",
-            ),
-            Signal("clock", 1, "1", "share of the gait cycle, in [0, 1)", None, "next_clock", 0.0),
-        ]
-        if self.counted:
-            first = tuple(default_command().tolist())
-            form = (NUM_COMMANDS, None, "the last", "commands", "commands", first)
-            self.inputs += [
-                Signal("last_commands", *form),
-                Signal("cycles", 1, "1", "of the gait since it began", None, "next_cycles", 0.0),
-            ]
-        self.outputs = [
-            Signal("action", NUM_JOINTS, "1", "within its limits", "joints"),
-            Signal("joint_targets", NUM_JOINTS, "rad", "for the joint control", "joints"),
-            Signal("next_clock", 1, "1", "share of the gait cycle at the end of this step"),
-        ]
-        if self.counted:
-            self.outputs.append(
-                Signal("next_cycles", 1, "1", "of the gait so far, after this step")
-            )
-
-    def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """``inputs`` -> ``outputs``."""
-        x = _by_name(self.inputs, values)
-        command, clock = x["commands"], x["clock"]
-        grown = self.whole
-        if self.counted:
-            same = (command[12:] == x["last_commands"][12:]).all()
-            cycles = x["cycles"] * same
-        if self.ramp is not None:
-            grown = (cycles / self.ramp).clamp(max=1.0)
-        if self.start is not None:
-            early = 1.0 - (cycles / self.start).clamp(max=1.0)
-            missing = (self.least - command[INDEX["frequency"]]).clamp(min=0.0)
-            command = command + self.is_frequency * (early * missing)
-        pose = self.pose(clock, grown, command)
-        terms = x | {
-            "joint_error": x["joint_angles"] - pose,
-            "joint_speed": x["joint_speeds"],
-            "command": self.command_gain * command + self.command_zero,
-            "clock": clock_signal(clock, command),
-            "gait": self._gait(command),
-        }
-        action = self.actor(self.row(terms)[None]).double().clamp(-self.limit, self.limit)
-        run = self.dt * command[INDEX["frequency"]]
-        clock = clock + run
-        targets = (pose + self.joint_scale * action).clamp(self.lowest, self.highest)
-        step = (action, targets, clock - clock.floor())
-        return (*step, cycles + run) if self.counted else step
-
-    def _gait(self, command: Tensor) -> Tensor:
-        """Index of the gait as a share of the last one's, as the observation has it: (1,)."""
-        trot, pronk, pace, bound = self.gait_shares.unbind()
-        phase, offset, pairs = (command[i : i + 1] > 0.25 for i in (12, 13, 14))
-        return th.where(phase, trot, th.where(pairs, pace, th.where(offset, bound, pronk)))
-
-
-class HighLevel(nn.Module):
-    """One decision (Sec. IV-B): goal, cues and sensors to the 15 commands.
-
-    Attributes:
-        inputs, outputs: what ``forward`` takes and gives, in order.
-    """
-
-    def __init__(self, policy: Policy, config: HighLevelConfig, low: LowLevelConfig) -> None:
-        super().__init__()
-        self.actor = ClippedActor(policy)
-        self.remember = policy.remember
-        layout = high_layout(config.cues)
-        self.row = Row(layout)
-        hidden = policy.state_size
-        decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
-        self.low = _constant(decoder.low[:12])
-        self.span = _constant(decoder.high[:12] - decoder.low[:12])
-        self.embedding = _constant(GAIT_TABLE[decoder.gaits])
-        self.limit = _constant(config.action_limit)
-        self.nominal = _constant(nominal_pose(low.robot))
-        step = config.decimation * low.physics.control_dt
-        seconds = round(config.episode_seconds / step) * step
-        self.seconds = _constant(seconds)
-        self.ahead = _constant([1.0, 0.0])
-        start = tuple(default_command().tolist())
-        family = "1 for the terrain under the robot, 0 for the others"
-        probes = (
-            "ground at points of the frame that turns by yaw alone, above a plane "
-            f"{low.robot.base_height:g} m under the trunk; clipped at {PROBE_RANGE:g} m"
-        )
-        cues = {
-            "family": Signal("family", len(SEMANTIC), "1", family, "families"),
-            "probes": Signal("probes", NUM_PROBES, "m", probes, "probes"),
-        }
-        self.inputs = [
-            Signal("goal", 2, "m", "ahead and to the left in the frame that turns by yaw alone"),
-            Signal("time_left", 1, "s", f"of {seconds:g} s"),
-            *_BODY,
-            Signal("last_decision", NUM_ACTIONS, "1", "the last", "decision", "decision", 0.0),
-            Signal("last_commands", NUM_COMMANDS, None, "the last", "commands", "commands", start),
-            Signal(
-                "clock",
-                1,
-                "1",
-                "the low policy's in its coming step",
-                start=0.0,
-                source="low.next_clock",
-            ),
-            *(cues[term.name] for term in layout if term.name in cues),
-            Signal("hidden", hidden, "1", "state of the LSTM", None, "next_hidden", 0.0),
-            Signal("cell", hidden, "1", "cell of the LSTM", None, "next_cell", 0.0),
-        ]
-        self.outputs = [
-            Signal("decision", NUM_ACTIONS, "1", "raw actions", "decision"),
-            Signal("commands", NUM_COMMANDS, None, "for the low policy", "commands"),
-            Signal("next_hidden", hidden, "1", "state of the LSTM"),
-            Signal("next_cell", hidden, "1", "cell of the LSTM"),
-        ]
-
-    def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """``inputs`` -> ``outputs``."""
-        x = _by_name(self.inputs, values)
-        goal = x["goal"]
-        distance = (goal * goal).sum(0, keepdim=True).sqrt()
-        direction = th.where(distance > 0.0, goal / distance, self.ahead)
-        terms = x | {
-            "goal": th.cat([GOAL_SCALE * distance, direction]),
-            "time_left": x["time_left"] / self.seconds,
-            "joint_error": x["joint_angles"] - self.nominal,
-            "joint_speed": x["joint_speeds"],
-            "last_action": self._normalise(x["last_decision"]),
-            "clock": clock_signal(x["clock"], x["last_commands"]),
-        }
-        if "probes" in x:
-            terms["probes"] = x["probes"].clamp(-PROBE_RANGE, PROBE_RANGE)
-        state = (x["hidden"].float()[None], x["cell"].float()[None])
-        latent, (hidden, cell) = self.remember(self.row(terms)[None], state)
-        decision = self.actor(latent).double()
-        return decision, self._decode(decision), hidden[0].double(), cell[0].double()
-
-    def _normalise(self, decision: Tensor) -> Tensor:
-        return decision.clamp(-self.limit, self.limit) / self.limit
-
-    def _decode(self, decision: Tensor) -> Tensor:
-        """As ``CommandDecoder.decode``: (13,) -> (15,)."""
-        x = self._normalise(decision)
-        n = len(self.embedding)
-        gait = (0.5 * n * (x[-1] + 1.0)).floor().clamp(0, n - 1).long()
-        return th.cat([self.low + 0.5 * (x[:-1] + 1.0) * self.span, self.embedding[gait]])
-
-
-def _by_name(signals: Sequence[Signal], values: Sequence[Tensor]) -> dict[str, Tensor]:
-    return {s.name: value for s, value in zip(signals, values, strict=True)}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -466,10 +72,10 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
     """Both policies from their files.
 
     Raises:
-        ValueError: a file that cannot be used, or levels that do not fit each other.
+        ValueError: a file that cannot be used, or policies that do not fit each other.
     """
     low_policy, low_config = load_low(low)
-    size = width(actor_layout(low_config.gyro))
+    size = width(actor_layout(low_config.robot, low_config.gyro))
     if low_policy.actor_dim != size:
         raise ConfigError(
             f"{low}: its configuration gives {size} observations, it takes {low_policy.actor_dim}"
@@ -480,7 +86,7 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
     return Pair(low_policy, low_config, high_policy, high_config)
 
 
-def interfaces(pair: Pair, low: LowLevel, high: HighLevel) -> dict[str, Table]:
+def interfaces(pair: Pair, low: LowGraph, high: HighGraph) -> dict[str, Table]:
     """What the two interface files say, by graph; ``tdgc.deploy`` has their schema."""
     config, task = pair.low_config, pair.high_config
     robot, physics = config.robot, config.physics
@@ -561,7 +167,7 @@ def _quantity(unit: str, value: Any) -> Table:
     return {"unit": unit, "value": value}
 
 
-def _head(name: str, policy: Policy, level: LowLevel | HighLevel, rate: float) -> Table:
+def _head(name: str, policy: Policy, graph: LowGraph | HighGraph, rate: float) -> Table:
     """What both interface files begin with."""
 
     def table(signal: Signal) -> Table:
@@ -576,8 +182,8 @@ def _head(name: str, policy: Policy, level: LowLevel | HighLevel, rate: float) -
         "policy": {k: v for k, v in policy.meta.items() if k not in ("config", "low")},
         "normalisation": "inside",
         "rate": _quantity("Hz", rate),
-        "inputs": [table(s) for s in level.inputs],
-        "outputs": [table(s) for s in level.outputs],
+        "inputs": [table(s) for s in graph.inputs],
+        "outputs": [table(s) for s in graph.outputs],
     }
 
 
@@ -598,14 +204,14 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
     Raises:
         OSError: a file cannot be written.
     """
-    low = LowLevel(pair.low, pair.low_config)
-    high = HighLevel(pair.high, pair.high_config, pair.low_config)
+    low = LowGraph(pair.low, pair.low_config)
+    high = HighGraph(pair.high, pair.high_config, pair.low_config)
     tables = interfaces(pair, low, high)
-    for name, level in (("low", low), ("high", high)):
+    for name, graph in (("low", low), ("high", high)):
         text = json.dumps(tables[name], indent=2) + "\n"
         interface_path(folder, name).write_text(text, encoding="utf-8")
         for form in formats:
-            _write_graph(level, folder / (name + FORMATS[form]))
+            _write_graph(graph, folder / (name + FORMATS[form]))
     _copy_robot(urdf_path(pair.low_config.robot), folder)
 
 
@@ -619,19 +225,19 @@ def _copy_robot(urdf: Path, folder: Path) -> None:
             shutil.copyfile(urdf.parent / name, folder / name)
 
 
-def _write_graph(level: LowLevel | HighLevel, path: Path) -> None:
-    example = tuple(th.full((s.size,), 0.5, dtype=th.float64) for s in level.inputs)
+def _write_graph(graph: LowGraph | HighGraph, path: Path) -> None:
+    example = tuple(th.full((s.size,), 0.5, dtype=th.float64) for s in graph.inputs)
     with quiet():
         if path.suffix == FORMATS["torchscript"]:
-            traced = th.jit.trace(level, example)  # type: ignore[no-untyped-call]
+            traced = th.jit.trace(graph, example)  # type: ignore[no-untyped-call]
             th.jit.save(traced, path)
             return
         th.onnx.export(
-            level,
+            graph,
             example,
             path,
-            input_names=[s.name for s in level.inputs],
-            output_names=[s.name for s in level.outputs],
+            input_names=[s.name for s in graph.inputs],
+            output_names=[s.name for s in graph.outputs],
             external_data=False,
             dynamo=True,
             verbose=False,

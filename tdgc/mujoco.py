@@ -7,12 +7,11 @@ Tiles, rules, tables and files are those of evaluate.py; physics is MuJoCo's, do
 settings. It needs the extra ``mujoco``.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,30 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from tdgc.benchmark.evaluation import (
-    Batch,
-    Cell,
-    Episode,
-    EpisodeLog,
-    Watcher,
-    closed_loop,
-    plan,
-    spread,
-)
-from tdgc.benchmark.flags import choose, choose_levels
+from tdgc.benchmark import flags
+from tdgc.benchmark.drivers import Driver
+from tdgc.benchmark.evaluation import Batch, Cell, Episode, EpisodeLog, Watcher, closed_loop, plan
 from tdgc.benchmark.recording import Recorder, Recording
 from tdgc.benchmark.results import describe, write_results
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
-from tdgc.deploy.interface import require
 from tdgc.deploy.log import LogWriter
-from tdgc.parallel.cores import usable_cores, workers_flag
+from tdgc.errors import require
+from tdgc.parallel.jobs import run_jobs
 from tdgc.show import film
 from tdgc.sim.commands import INDEX
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, height_map, is_map
 from tdgc.sim.world import WindowError
 
 if TYPE_CHECKING:
@@ -53,7 +43,7 @@ POLICY = "tdgc-mujoco"  # in the results, beside PyBullet's "tdgc"
 _PACKAGES = ("jsonschema", "mujoco", "onnxruntime")  # the extra `mujoco` of setup.cfg
 
 
-class Deployed:
+class Deployed(Driver):
     """An exported pair in the closed loop with one simulated robot: driver and executor at once.
 
     Args:
@@ -65,9 +55,6 @@ class Deployed:
         self.controller, self.log = controller, log
         self.config = HighLevelConfig(decimation=controller.decimation, commands=controller.bounds)
         self.bounds = controller.bounds
-        self.action: NDArray[np.floating] | None = None
-        self.told: str | None = None
-        self.probes: Array | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal, self._family = loco, goal[0], family
@@ -113,9 +100,9 @@ def load(export: Path) -> Controller:
 def run_episode(
     cell: Cell,
     pair: Deployed,
-    config: MujocoConfig,
+    config: "MujocoConfig",
     seed: int,
-    watcher: Watcher,
+    watchers: Sequence[Watcher],
     visual: bool = False,
 ) -> Episode:
     """Run the only episode of ``cell``.
@@ -125,7 +112,7 @@ def run_episode(
         pair: what drives the robot.
         config: MuJoCo's settings.
         seed: of the evaluation's tiles.
-        watcher: who looks on.
+        watchers: who look on.
         visual: keep what only a window shows.
 
     Raises:
@@ -141,15 +128,22 @@ def run_episode(
     )
     episode = EpisodeLog(batch)
     pair.begin(batch.loco, batch.goal, batch.told)
-    watcher.begin(cell, batch.loco, batch.field, batch.goal)
-    closed_loop(pair, pair, batch, episode, watcher)
+    for watcher in watchers:
+        watcher.begin(cell, batch.loco, batch.field, batch.goal)
+    closed_loop(pair, pair, batch, episode, watchers)
     if pair.log is not None:
         pair.log.end(pair.readings())
     return episode.episodes()[0]
 
 
 def run_cell(
-    cell: Cell, export: Path, config: MujocoConfig, seed: int, filmed: int, logs: Path, logged: int
+    cell: Cell,
+    export: Path,
+    config: "MujocoConfig",
+    seed: int,
+    filmed: int,
+    logs: Path,
+    logged: int,
 ) -> tuple[list[Episode], list[Recording]]:
     """Run the episodes of a cell one after another; recordings of the first ``filmed``, and logs
     of the first ``logged`` written into ``logs``."""
@@ -158,7 +152,7 @@ def run_cell(
         one = Cell(cell.policy, cell.condition, cell.family, cell.level, number, 1)
         pair = Deployed(controller, LogWriter(controller) if number < logged else None)
         recorder = Recorder(pair, seed, filmed)
-        episode = run_episode(one, pair, config, seed, recorder)
+        episode = run_episode(one, pair, config, seed, [recorder])
         episodes.append(episode)
         recordings += recorder.recordings()
         if pair.log is not None:
@@ -166,7 +160,7 @@ def run_cell(
     return episodes, recordings
 
 
-def run_table(args: argparse.Namespace, config: MujocoConfig) -> list[str]:
+def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     """Run all cells and write everything; what is missing, a line each."""
     for old in (*args.out.glob("logs/*.npz"), *args.out.glob("films/*")):
         old.unlink()
@@ -187,7 +181,7 @@ def run_table(args: argparse.Namespace, config: MujocoConfig) -> list[str]:
     episodes: list[Episode] = []
     recordings: list[Recording] = []
     with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
-        for ran, recorded in spread(work, cells, args.workers):
+        for ran, recorded in run_jobs(work, cells, args.workers):
             episodes += ran
             recordings += recorded
             bar.update(len(ran))
@@ -198,7 +192,7 @@ def run_table(args: argparse.Namespace, config: MujocoConfig) -> list[str]:
     return film.produce(recordings, args.out / "films", args.workers) if recordings else []
 
 
-def show(args: argparse.Namespace, config: MujocoConfig) -> None:
+def show(args: argparse.Namespace, config: "MujocoConfig") -> None:
     """Show the first episode of the first family and level in MuJoCo's viewer.
 
     Raises:
@@ -209,20 +203,14 @@ def show(args: argparse.Namespace, config: MujocoConfig) -> None:
     cell = Cell(POLICY, "nominal", args.families[0], args.levels[0], 0, 1)
     with Window() as window:
         pair = Deployed(load(args.export))
-        episode = run_episode(cell, pair, config, args.seed, window, visual=True)
+        episode = run_episode(cell, pair, config, args.seed, [window], visual=True)
     print(f"{episode.outcome.replace('_', ' ')}, {episode.time_s:.1f} s")
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--export", type=Path, required=True, help="folder of tdgc.export")
-    parser.add_argument("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
-    parser.add_argument(
-        "--families",
-        default="all",
-        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING}",
-    )
-    parser.add_argument("--episodes", type=int, default=100, help="per cell (100)")
+    flags.add_arguments(parser, "runs/mujoco")
     parser.add_argument(
         "--armature", type=float, metavar="KG_M2", help="rotor inertia of each joint (0.01 kg m^2)"
     )
@@ -237,23 +225,24 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         default=[],
         help="change MuJoCo's settings, e.g. solref=0.02; may be repeated",
     )
-    for flag, what in (("--video", "films, sheets and strips"), ("--log", "logs")):
-        text = f"{what} of the first N episodes per cell (1)"
-        parser.add_argument(flag, type=int, nargs="?", const=1, default=0, metavar="N", help=text)
+    parser.add_argument(
+        "--log",
+        type=int,
+        nargs="?",
+        const=1,
+        default=0,
+        metavar="N",
+        help="logs of the first N episodes of each cell (1)",
+    )
     parser.add_argument(
         "--gui",
         action="store_true",
         help="MuJoCo's viewer instead of a table, on the first tile of the first family and level",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
-    parser.add_argument(
-        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
-    )
-    parser.add_argument("--out", type=Path, default=Path("runs/mujoco"), help="results folder")
     return parser.parse_args(arguments)
 
 
-def check(args: argparse.Namespace) -> MujocoConfig:
+def check(args: argparse.Namespace) -> "MujocoConfig":
     """Read what the flags ask for; MuJoCo's settings.
 
     Raises:
@@ -262,22 +251,12 @@ def check(args: argparse.Namespace) -> MujocoConfig:
     require("MuJoCo's benchmark", _PACKAGES, "mujoco")
     from tdgc.sim.mujoco_world import MujocoConfig
 
-    args.levels = choose_levels(args.levels)
-    maps = tuple(filter(is_map, args.families.split(",")))
-    args.families = choose(args.families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
-    for name in maps:
-        height_map(name)
-    args.workers = usable_cores() if args.workers == "auto" else args.workers
-    for flag, value in (("--episodes", args.episodes), ("--workers", args.workers)):
-        if value < 1:
-            raise ValueError(f"{flag} must be at least 1, not {value}")
+    flags.read(args)
+    if not 0 <= args.log <= args.episodes:
+        raise ValueError(f"--log must lie in [0, --episodes], not {args.log}")
     for flag, value in (("--video", args.video), ("--log", args.log)):
-        if not 0 <= value <= args.episodes:
-            raise ValueError(f"{flag} must lie in [0, --episodes], not {value}")
         if args.gui and value:
             raise ValueError(f"--gui is only to be looked at: no {flag}")
-    if not 0 <= args.seed < 2**32:
-        raise ValueError(f"--seed must lie in [0, 2**32), not {args.seed}")
     config = with_overrides(MujocoConfig(), args.assignments)
     for key in ("armature", "joint_friction"):
         if getattr(args, key) is not None:

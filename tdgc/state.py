@@ -4,8 +4,6 @@ What has a state gives copies of its arrays, and takes them back in place with `
 checkpoint keeps the arrays and the rest in two files, see ``split`` and ``join``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

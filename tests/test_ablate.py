@@ -15,10 +15,10 @@ from tdgc.ablate.__main__ import choose, main, plan
 from tdgc.ablate.cells import Cell, Runner
 from tdgc.ablate.table import describe, rows
 from tdgc.ablate.variants import HELPS, VARIANTS, WHOLE, Variant, variants
-from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, with_overrides
+from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, LowLevelConfig, with_overrides
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.learn.run import Interruption
-from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_mirror, load_low, paired
+from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_mirror, paired
 
 ROOT = Path(__file__).resolve().parents[1]
 LOW = PRETRAINED / "low"
@@ -36,7 +36,7 @@ def named(name: str) -> Variant:
 @pytest.mark.parametrize("alone", [False, True])
 def test_every_variant_changes_one_thing_and_fits_the_low_policy(alone: bool) -> None:
     base = with_overrides(HighTrainConfig(), NO_TEACHER if alone else ())
-    _, low = load_low(LOW)
+    low = LowLevelConfig()  # of a policy that train_low.py gives
     seen = []
     for variant in variants(alone):
         if variant.settings is not None:
@@ -153,7 +153,7 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     """Stopped in the middle of its first training, then finished with a cell that cannot be. What
     it trains is what train_high.py trains."""
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(evaluate, "spread", in_this_process)
+    monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
     out = tmp_path / "ablation"
     command = [*TINY, "--only", "full,fixed-pose,uncalibrated", "--seeds", "5", "--out", str(out)]
     asked = []
@@ -207,7 +207,7 @@ def test_a_cell_that_cannot_be_trained_is_named_and_the_others_are_kept(
 ) -> None:
     """Two minibatches of two robots' rollouts leave none for one; ``gp`` needs no training."""
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(evaluate, "spread", in_this_process)
+    monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
     flags = [*TINY, "--set", "ppo.minibatches=5", "--only", "full,fixed-pose,gp"]
     assert main([*flags, "--out", str(tmp_path)]) == 1
     table = json.loads((tmp_path / "ablation.json").read_text())["rows"]

@@ -1,7 +1,6 @@
 """Responses are learned and inverted, and a copy of a policy learns to act on the result."""
 
 import dataclasses
-import functools
 from pathlib import Path
 
 import numpy as np
@@ -9,19 +8,19 @@ import pytest
 import torch as th
 
 from tdgc import calibration, policies
-from tdgc.calibration import Corrector, ResponseModel, distil, measure, training_tasks
+from tdgc.calibration import Corrector, ResponseModel, distil, measure, shown, training_tasks
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
-from tdgc.parallel.vec import TaskVecEnv
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
-from tdgc.sim.commands import INDEX, commands_of, observed_command
+from tdgc.sim.commands import INDEX
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
-from tdgc.sim.robot import Array
+from tdgc.sim.robot import Array, action_scale
+from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 
 RANGES = CommandRanges()
-HALF = np.array([1.0, 0.6, 1.0])  # of the velocity ranges
+MIDDLE, HALF = np.array([0.1, 0.0, 0.0]), np.array([1.1, 0.6, 1.0])  # of the velocity ranges
 CONFIG = LowLevelConfig(
     families=("rough", "stair"), physics=PhysicsConfig(substeps=4, hold=1), gyro=False
 )
@@ -36,17 +35,18 @@ def commands(n: int, width: float = 1.0) -> Array:
     return np.concatenate([command, gait_embedding(np.arange(n) % 4)], axis=1)
 
 
-def save_low(path: Path) -> Policy:
+def save_low(path: Path, config: LowLevelConfig = CONFIG) -> Policy:
     """A small symmetric policy whose actions depend on everything it sees."""
     th.manual_seed(0)
     policy = AsymmetricActorCriticPolicy(
-        *low_spaces(CONFIG), lambda _: 1e-3, actor_dim=width(actor_layout(CONFIG.gyro)),
-        mirror=low_mirror(CONFIG), net_arch=[32],
+        *low_spaces(config), lambda _: 1e-3,
+        actor_dim=width(actor_layout(config.robot, config.gyro)),
+        mirror=low_mirror(config), net_arch=[32],
     )  # fmt: skip
     with th.no_grad():
         for parameter in policy.parameters():
             parameter += 0.1 * th.randn_like(parameter)
-    policies.save(path, policy, {"config": to_dict(CONFIG), "steps": 7})
+    policies.save(path, policy, {"config": to_dict(config), "steps": 7})
     return policies.load(path)
 
 
@@ -62,11 +62,6 @@ def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # ------------------------------------------------------------------ responses
-
-
-def test_what_is_seen_of_commands_can_be_read_back() -> None:
-    command = commands(8)
-    np.testing.assert_allclose(commands_of(observed_command(command)), command, atol=1e-12)
 
 
 def test_a_response_is_learned_and_put_right_for_each_gait() -> None:
@@ -100,7 +95,7 @@ def test_what_cannot_be_reached_is_not_asked_for_without_end() -> None:
     asked = commands(40)
     correct = Corrector(model, seed=0)
     corrected = correct(asked)
-    assert (np.abs(corrected[:, :3]) <= 1.2 * HALF + 1e-6).all()
+    assert (np.abs(corrected[:, :3] - MIDDLE) <= 1.2 * HALF + 1e-6).all()
     assert np.abs(corrected[:, 0]).max() > 1.1
     beyond = asked.copy()
     beyond[:, 0] = 2.0
@@ -129,7 +124,8 @@ def test_a_range_of_one_point_is_no_division_by_zero() -> None:
 def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None:
     given, reached = measure(low, 24, seed=5)
     assert len(given) == len(reached) <= 24 and reached.shape[1] == 3
-    assert (np.abs(given[:, :3]) <= 1.4 * HALF).all() and (np.abs(given[:, :3]) > HALF).any()
+    assert (np.abs(given[:, :3] - MIDDLE) <= 1.4 * HALF + 1e-9).all()
+    assert (np.abs(given[:, :3] - MIDDLE) > HALF).any()
     rows = {tuple(row) for row in given[:, 12:]}
     assert rows <= {tuple(gait_embedding(g)) for g in range(len(GAITS))}
     assert len(rows) >= 2
@@ -141,28 +137,63 @@ def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None
 
 
 def test_robots_learn_on_a_plane_and_on_all_levels() -> None:
-    tasks = training_tasks(CONFIG, 30, seed=0)
-    assert [task.num_robots for task in tasks.tasks] == [18, 12]
-    assert tasks.tasks[0].tiles is None
-    assert tasks.tasks[1].level.tolist() == [*range(11), 0]
-    assert all((task.commands.share == 1.0).all() for task in tasks.tasks)
-    tasks.close()
+    plane, rugged = training_tasks(CONFIG, 30, seed=0)
+    assert (plane.num_robots, rugged.num_robots) == (18, 12)
+    assert plane.tiles is None
+    assert rugged.level.tolist() == [*range(11), 0]
+    for task in (plane, rugged):
+        assert (task.commands.share == 1.0).all()
+        task.close()
+
+
+def faster(command: Array) -> Array:
+    return np.concatenate([1.2 * command[:, :3], command[:, 3:]], axis=1)
+
+
+@pytest.mark.parametrize("walks", [True, False])
+def test_what_is_shown_leads_to_the_targets_of_corrected_commands(walks: bool) -> None:
+    """Those that the policy gives where robots in the same state are told to go faster."""
+    robot = dataclasses.replace(CONFIG.robot, commanded_gait=walks)
+    config = dataclasses.replace(CONFIG, robot=robot)
+    size = width(actor_layout(robot, config.gyro))
+    rng = np.random.default_rng(0)
+
+    class Linear:
+        """A policy whose actions depend on everything it sees."""
+
+        actor_dim, weights = size, rng.normal(0.0, 0.1, (size, 12))
+
+        def predict(self, x: Array) -> tuple[Array, None]:
+            return np.clip(x @ self.weights, -4.0, 4.0), None
+
+    task = LowLevelTask(dataclasses.replace(config, terrain="plane"), 6, seed=3, training=False)
+    task.reset(np.arange(6))
+    for _ in range(10):
+        task.step(np.zeros((6, 12)))
+    low, loco = Linear(), task.locomotion
+    x, actions = shown(low, faster, task)  # type: ignore[arg-type]
+    assert (x == task.observe()[:, :size]).all()
+    targets = loco.pose() + actions * action_scale(robot)
+    loco.command = faster(loco.command)
+    own, _ = low.predict(task.observe()[:, :size])
+    np.testing.assert_allclose(targets, loco.pose() + own * action_scale(robot), atol=1e-5)
+    task.close()
 
 
 def test_a_student_learns_what_is_done_at_corrected_commands(
-    low: Policy, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """In so few turns only where the pose does not depend on velocities."""
     monkeypatch.setattr(calibration, "_TURN", 8)
-    tasks = functools.partial(training_tasks, CONFIG)
-    env = TaskVecEnv(tasks, 10, 1, 0, low_spaces(CONFIG))
-
-    def correct(command: Array) -> Array:
-        return np.concatenate([1.2 * command[:, :3], command[:, 3:]], axis=1)
-
+    standing = dataclasses.replace(CONFIG.robot, commanded_gait=False)
+    config = dataclasses.replace(CONFIG, robot=standing)
+    low = save_low(tmp_path / "low", config)
+    tasks = training_tasks(config, 10, seed=0)
     try:
-        student, first, last = distil(low, correct, env, turns=5, seed=0)
+        student, first, last = distil(low, faster, tasks, turns=5, seed=0)
     finally:
-        env.close()
+        for task in tasks:
+            task.close()
     assert last < 0.5 * first
     assert any(not th.equal(t, low.tensors[name]) for name, t in student.tensors().items())
 
@@ -198,11 +229,7 @@ def test_script(
     ],
 )
 def test_bad_input_is_one_line(
-    low: Policy,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    flags: list[str],
-    message: str,
+    low: Policy, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], message: str
 ) -> None:
     policies.save_copy(tmp_path / "low", low, {}, low.meta)
     out = tmp_path / "out"

@@ -128,7 +128,7 @@ def test_no_cluster(
     monkeypatch.setitem(sys.modules, "ray", None)
     assert train_high.main(["--cluster", "auto", "--out", str(out)]) == 2
     assert capsys.readouterr().err == (
-        "train_high.py: --cluster needs Ray: install the extra 'cluster', "
+        "train_high.py: --cluster needs ray: install the extra 'cluster', "
         "pip install -c constraints.txt -e '.[cluster]'\n"
     )
     assert not out.exists()
@@ -285,12 +285,12 @@ def die(number: int) -> None:
 def test_jobs_are_done_in_order_and_fail_as_they_do_here(
     joined: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert list(cluster.spread(double, range(6), 2)) == [0, 2, 4, 6, 8, 10]
+    assert list(cluster.run_jobs(double, range(6), 2)) == [0, 2, 4, 6, 8, 10]
     with pytest.raises(ValueError, match="a negative number"):
-        list(cluster.spread(double, [1, -1], 2))
+        list(cluster.run_jobs(double, [1, -1], 2))
     monkeypatch.setattr(cluster, "_RERUNS", 1)
     with pytest.raises(WorkerError, match=r"^a job was lost 2 times \(WorkerCrashedError\)$"):
-        list(cluster.spread(die, [0], 1))
+        list(cluster.run_jobs(die, [0], 1))
 
 
 def test_an_evaluation_that_loses_a_node_gives_the_same_table(

@@ -70,8 +70,8 @@ def test_a_run_from_before_the_task_was_configured() -> None:
     assert then["command_draw"] == {
         "gaits": [0.2, 0.2, 0.3, 0.3], "standing": 0.1,
         "leaps": 0.05, "leap_vx": [0.85, 1.0], "leap_frequency": [0.0, 0.375],
-        "growth": 0.05, "growth_steps": 200, "growth_velocity": 0.5, "growth_yaw_rate": 0.5,
-        "growth_contact": 0.7,
+        "retries": 0.0, "growth": 0.05, "growth_steps": 200, "growth_velocity": 0.5,
+        "growth_yaw_rate": 0.5, "growth_contact": 0.7,
     }  # fmt: skip
     assert then["crossing"] == {
         "share": 0.8, "gaits": [0.8, 0.05, 0.075, 0.075], "trench_gaits": [0.15, 0.85, 0.0, 0.0],
@@ -122,10 +122,7 @@ def test_configurations_cannot_be_changed_in_place() -> None:
         ({"env": {"commands": {"vx": [1, -1]}}}, r"must be \[low, high\] with low <= high"),
         ({"env": {"commands": {"vx": [0, "1"]}}}, "'env.commands.vx' must be of type float, not"),
         ({"env": {"commands": {"vx": [0, 1, 2]}}}, "'env.commands.vx' must have 2 values, not 3"),
-        (
-            {"env": {"crossing": {"share": 1.5}}},
-            "crossing.share' must be from 0 to 1, not 1.5",
-        ),
+        ({"env": {"crossing": {"share": 1.5}}}, "crossing.share' must be from 0 to 1, not 1.5"),
         ({"env": {"crossing": {"gaits": [1, 1, 0, 0]}}}, "crossing.gaits' must add up to 1, not"),
         ({"env": {"crossing": {"gaits": [2, -1, 0, 0]}}}, "gaits' must be from 0 to 1, not 2"),
         ({"env": {"commands": {"vx": [0, float("inf")]}}}, "vx' must be a finite number, not inf"),

@@ -52,7 +52,7 @@ def blamed(driver: HierarchyDriver, low: Any, cells: list[tuple[str, int, int]])
     layers = []
     for family, level, count in cells:
         tracer = Tracer(driver, SEED)
-        run_cell(Cell("tdgc", "nominal", family, level, 0, count), low, driver, SEED, tracer)
+        run_cell(Cell("tdgc", "nominal", family, level, 0, count), low, driver, SEED, [tracer])
         failures = [t for t in tracer.traces() if t.outcome != "reached"]
         layers += [diagnose(t, HIPS).layer for t in failures]
     return layers
@@ -81,14 +81,12 @@ class Blindfold(HierarchyDriver):
         super().begin(loco, turned, "mixed")
 
     def command(self, step: int) -> Array:
-        def blind(*arguments: Any) -> Any:
-            observation = observe(*arguments)
-            observation[:, -NUM_PROBES:] = 0.0
-            return observation
+        def blind(layout: Any, seen: Any) -> Any:
+            return observe(layout, seen._replace(probes=0.0 * seen.probes))
 
-        observe = drivers.observe_high
+        observe = drivers.observe
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(drivers, "observe_high", blind)
+            patch.setattr(drivers, "observe", blind)
             return super().command(step)
 
 
@@ -224,7 +222,7 @@ def test_who_walks_blindly_into_a_trench_made_no_decision():
 def test_the_baseline_is_not_blamed_on_the_low_level_in_gap(low):
     driver = drivers.BaselineDriver()
     tracer = Tracer(driver, SEED)
-    run_cell(Cell("gp", "nominal", "gap", 8, 0, 3), low[0], driver, SEED, tracer)
+    run_cell(Cell("gp", "nominal", "gap", 8, 0, 3), low[0], driver, SEED, [tracer])
     failures = [diagnose(t, HIPS) for t in tracer.traces() if t.outcome != "reached"]
     assert len(failures) >= 2
     assert {f.cause for f in failures} == {"walked blindly into a trench"}

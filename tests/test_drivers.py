@@ -33,16 +33,17 @@ from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command, gait_index
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.observation import width
+from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import Array
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import (
+    GUIDANCE,
     PRETRAINED,
     SEMANTIC,
     NavigationTask,
+    Seen,
     high_layout,
     load_low,
-    observe_high,
 )
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.probes import PROBES, height_probes
@@ -62,7 +63,7 @@ def save_high(
     hidden: int | None = 8,
 ) -> Path:
     """A small high policy with random weights that walks about: gaits and commands vary."""
-    size = size or width(high_layout(config.cues))
+    size = size or width(high_layout(config))
     policy = FastRecurrentPolicy(
         spaces.Box(-np.inf, np.inf, (size,)),
         spaces.Box(-config.action_limit, config.action_limit, (NUM_ACTIONS,)),
@@ -81,8 +82,9 @@ def save_high(
         if hidden is not None:
             policy.lstm_actor.weight_ih_l0.mul_(8.0)  # quick to change its mind
         policy.action_net.weight[:-1].mul_(0.5)
-        policy.action_net.weight[-1].mul_(2.0)  # the gait
+        policy.action_net.weight[-1].mul_(4.0)
         policy.action_net.bias.copy_(th.from_numpy(CommandDecoder().encode(walk)))
+        policy.action_net.bias[-1] = 0.0  # between pronk and pace
     trained_on = {"config": to_dict(low[1]), "observation": low[0].actor_dim}
     policies.save(path, policy, {"config": to_dict(config), "low": trained_on} | (meta or {}))
     return path
@@ -137,7 +139,10 @@ def test_the_teacher_drives_as_it_teaches(low, family):
         driver.begin(task.locomotion, task.goal, family)
         for step in range(12):
             if step % 5 == 0:
-                taught = task.decoder.decode(task.observe()[:, -NUM_ACTIONS:].astype(float))
+                task.teacher.watch(task.locomotion, task.step_seconds)
+                taught = task.decoder.decode(
+                    task.observe()[:, -GUIDANCE:][:, :NUM_ACTIONS].astype(float)
+                )
             np.testing.assert_allclose(driver.command(step), taught, atol=1e-6)
             executor.step(taught)
         assert (gait_index(taught) == (1 if family == "gap" else 0)).all()  # pronk, trot
@@ -207,8 +212,9 @@ def test_mixed_terrain_is_unknown_to_the_high_level(low, tmp_path):
         def expected(index: int) -> Array:
             zero, families = np.zeros((1, NUM_ACTIONS)), np.array([index])
             probes = height_probes(loco, PROBES["lines"])
-            seen = observe_high(loco, goal, np.zeros(1), zero, families, config.cues, probes)
-            return CommandDecoder(config.commands).decode(high.predict(seen)[0])
+            seen = Seen(loco, goal, np.zeros(1), zero, families, probes, np.zeros(1))
+            action, _ = high.predict(observe(high_layout(config), seen))
+            return CommandDecoder(config.commands).decode(action)
 
         for family in ("rough", "tilt"):
             assert np.array_equal(first_command(family), expected(SEMANTIC.index(family)))
@@ -254,7 +260,7 @@ def test_files_that_are_no_high_level_are_refused(low, tmp_path):
     with pytest.raises(ConfigError, match=r"high: its meta lacks what it was trained on$"):
         load_high(path, *low)
     path = save_high(tmp_path / "high", low, size=80)
-    with pytest.raises(ConfigError, match=r"high policy that observes 86 values, not 80$"):
+    with pytest.raises(ConfigError, match=r"high policy that observes 91 values, not 80$"):
         load_high(path, *low)
     with pytest.raises(policies.PolicyFileError, match=r"none.json: no such file$"):
         load_high(tmp_path / "none", *low)

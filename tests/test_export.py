@@ -19,24 +19,18 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
 from tdgc.deploy.controller import FORMATS, Graph
+from tdgc.deploy.graphs import HighGraph, LowGraph, clock_signal
 from tdgc.deploy.interface import ExportError
-from tdgc.export import TOLERANCE, HighLevel, LowLevel
+from tdgc.export import TOLERANCE
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
 from tdgc.sim.geometry import urdf_path
 from tdgc.sim.locomotion import Locomotion, actor_layout
-from tdgc.sim.observation import width
+from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import JOINTS, nominal_pose
-from tdgc.tasks.high_env import (
-    PRETRAINED,
-    NavigationTask,
-    high_layout,
-    high_mirror,
-    load_low,
-    observe_high,
-)
+from tdgc.tasks.high_env import PRETRAINED, NavigationTask, Seen, high_layout, high_mirror, load_low
 from tdgc.tasks.low_observation import low_mirror
 from tdgc.tasks.probes import PROBES, height_probes
 
@@ -63,7 +57,7 @@ def random_high(
     path: Path, config: HighLevelConfig, low: LowLevelConfig = LOW_CONFIG, hidden: int | None = 32
 ) -> Path:
     """A high policy with random weights, saved as ``train_high.py`` saves one."""
-    size = width(high_layout(config.cues))
+    size = width(high_layout(config))
     limit = config.action_limit
     mirror = high_mirror(config) if config.probes == "lines" else None
     policy = FastRecurrentPolicy(
@@ -77,7 +71,7 @@ def random_high(
 
 
 def random_low(path: Path, config: LowLevelConfig, symmetric: bool) -> Policy:
-    size, limit = width(actor_layout(config.gyro)), config.robot.action_limit
+    size, limit = width(actor_layout(config.robot, config.gyro)), config.robot.action_limit
     mirror = low_mirror(config).actor_part(size) if symmetric else None
     policy = AsymmetricActorCriticPolicy(
         unbounded(size), spaces.Box(-limit, limit, (12,)), lambda _: 1e-3,
@@ -121,14 +115,14 @@ def body(loco: Locomotion, k: int) -> dict[str, np.ndarray]:
     }
 
 
-def run(level: LowLevel | HighLevel, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def run(graph: LowGraph | HighGraph, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Outputs by name of a graph before its export."""
-    inputs = [th.as_tensor(values[s.name], dtype=th.float64) for s in level.inputs]
-    assert [tuple(x.shape) for x in inputs] == [(s.size,) for s in level.inputs]
-    outputs = level(*inputs)
-    assert [tuple(x.shape) for x in outputs] == [(s.size,) for s in level.outputs]
+    inputs = [th.as_tensor(values[s.name], dtype=th.float64) for s in graph.inputs]
+    assert [tuple(x.shape) for x in inputs] == [(s.size,) for s in graph.inputs]
+    outputs = graph(*inputs)
+    assert [tuple(x.shape) for x in outputs] == [(s.size,) for s in graph.outputs]
     assert all(x.dtype == th.float64 for x in outputs)
-    return {s.name: x.numpy() for s, x in zip(level.outputs, outputs, strict=True)}
+    return {s.name: x.numpy() for s, x in zip(graph.outputs, outputs, strict=True)}
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +178,7 @@ def test_low_level_is_the_executors_step(
     )
     config = LowLevelConfig(gyro=gyro, robot=robot)
     policy = random_low(tmp_path / "low", config, symmetric)
-    level = LowLevel(policy, config)
+    graph = LowGraph(policy, config)
     m, rng = 24, np.random.default_rng(0)
     loco = Locomotion(m, config.robot, config.physics, None, gyro)
     try:
@@ -203,7 +197,7 @@ def test_low_level_is_the_executors_step(
             own = {"last_action": history[0, k], "action_before": history[1, k]}
             given = {"commands": loco.command[k], "clock": clock[k : k + 1]}
             gait = {"last_commands": before[k], "cycles": cycles[k : k + 1]}
-            got = run(level, sensed[k] | own | given | gait)
+            got = run(graph, sensed[k] | own | given | gait)
             assert got["action"] == pytest.approx(loco.actions[0, k], abs=3e-6)
             assert got["joint_targets"] == pytest.approx(loco.targets[0, k], abs=1e-6)
             assert got["next_clock"] == pytest.approx(loco.clock.clock[k], abs=1e-15)
@@ -233,7 +227,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(
     )
     policy = policies.load(random_high(tmp_path / "high", config))
     assert policy.state_size == (64 if probes == "lines" else 32)
-    level = HighLevel(policy, config, LOW_CONFIG)
+    graph = HighGraph(policy, config, LOW_CONFIG)
     task = NavigationTask(config, LOW, 5, seed=2, training=False)
     loco, rng = task.locomotion, np.random.default_rng(1)
     try:
@@ -243,18 +237,21 @@ def test_high_level_is_the_tasks_observation_and_decoder(
         last = rng.uniform(-3.0, 3.0, (5, 13)).astype(np.float32)
         memory = rng.normal(0.0, 0.5, (2, 5, policy.state_size)).astype(np.float32)
         elapsed = np.arange(5) * 17
-        seen = observe_high(
-            loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
-            task.family_index, cues, height_probes(loco, PROBES[probes]),
+        heights, late = height_probes(loco, PROBES[probes]), np.arange(5) % 2
+        seen = observe(
+            high_layout(config),
+            Seen(
+                loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
+                task.family_index, heights, late,
+            ),
         )  # fmt: skip
         wanted, (hidden, cell) = policy.predict(seen, (memory[:1], memory[1:]))
         state = loco.world.state
         for k in range(5):
             c, s = np.cos(state.yaw[k]), np.sin(state.yaw[k])
             x, y = task.goal[k] - state.position[k, :2]
-            heights = np.zeros(32) if cues in ("none", "semantic") else 0.5 * seen[k, -32:]
             got = run(
-                level,
+                graph,
                 body(loco, k)
                 | {
                     "goal": np.array([c * x + s * y, c * y - s * x]),
@@ -263,7 +260,8 @@ def test_high_level_is_the_tasks_observation_and_decoder(
                     "last_commands": loco.command[k],
                     "clock": loco.clock.clock[k : k + 1],
                     "family": np.eye(6)[k],
-                    "probes": np.where(np.abs(heights) < 0.5, heights, 3.0 * heights),
+                    "probes": np.where(np.abs(heights[k]) < 0.5, 1.0, 3.0) * heights[k],
+                    "probe_age": 0.08 * late[k : k + 1],
                     "hidden": memory[0, k],
                     "cell": memory[1, k],
                 },
@@ -278,8 +276,8 @@ def test_high_level_is_the_tasks_observation_and_decoder(
 
 def test_decoding_is_the_decoders_to_the_last_bit_of_a_gait(high: Path) -> None:
     pair = export.load_pair(LOW, high)
-    level, decoder = (
-        HighLevel(pair.high, pair.high_config, pair.low_config),
+    graph, decoder = (
+        HighGraph(pair.high, pair.high_config, pair.low_config),
         CommandDecoder(HIGH_CONFIG.commands),
     )
     rng = np.random.default_rng(3)
@@ -288,17 +286,17 @@ def test_decoding_is_the_decoders_to_the_last_bit_of_a_gait(high: Path) -> None:
     near = [np.nextafter(edges, np.float32(side)) for side in (-2, 2)]
     actions[:11, -1] = [*edges, *near[0], *near[1], -1.0, 1.0]
     for action in actions:
-        got = level._decode(th.tensor(action)).numpy()
+        got = graph._decode(th.tensor(action)).numpy()
         assert got == pytest.approx(decoder.decode(action), abs=1e-15)
         assert np.array_equal(got[12:], decoder.decode(action)[12:])
 
 
 def test_a_fixed_set_of_gaits_is_decoded_as_the_decoder_does(tmp_path: Path) -> None:
     config = dataclasses.replace(HIGH_CONFIG, gaits=("pace", "trot", "bound"))
-    level = HighLevel(policies.load(random_high(tmp_path / "high", config)), config, LOW_CONFIG)
+    graph = HighGraph(policies.load(random_high(tmp_path / "high", config)), config, LOW_CONFIG)
     actions = np.random.default_rng(0).uniform(-1.2, 1.2, (50, 13))
     wanted = CommandDecoder(config.commands, gaits=config.gaits).decode(actions)
-    found = [level._decode(th.from_numpy(action)).numpy() for action in actions]
+    found = [graph._decode(th.from_numpy(action)).numpy() for action in actions]
     np.testing.assert_allclose(found, wanted, atol=1e-12)
     assert len(np.unique(wanted[:, 12:], axis=0)) == 3
 
@@ -312,16 +310,16 @@ def test_clock_signal_is_the_phase_clocks() -> None:
     phases.reset(np.arange(200), clock)
     phases.update(commands[:, 12:], commands[:, 5])
     for k, wanted in enumerate(phases.signal()):
-        got = export.clock_signal(th.tensor(clock[k : k + 1]), th.tensor(commands[k]))
+        got = clock_signal(th.tensor(clock[k : k + 1]), th.tensor(commands[k]))
         assert got.numpy() == pytest.approx(wanted, abs=1e-14)
 
 
 def test_goal_under_the_robot_counts_as_ahead(high: Path) -> None:
     pair = export.load_pair(LOW, high)
-    level = HighLevel(pair.high, pair.high_config, pair.low_config)
-    rest = {s.name: np.full(s.size, 0.1) for s in level.inputs}
+    graph = HighGraph(pair.high, pair.high_config, pair.low_config)
+    rest = {s.name: np.full(s.size, 0.1) for s in graph.inputs}
     at, ahead, left = (
-        run(level, rest | {"goal": np.array(goal)})["decision"]
+        run(graph, rest | {"goal": np.array(goal)})["decision"]
         for goal in ([0.0, 0.0], [1e-9, 0.0], [0.0, 1e-9])
     )
     assert np.array_equal(at, ahead) and np.abs(left - at).max() > 1e-3
@@ -374,11 +372,7 @@ def without_sources(table: dict[str, Any]) -> None:
     ],
 )
 def test_check_finds_an_interface_that_says_something_else(
-    short: Path,
-    tmp_path: Path,
-    graph: str,
-    change: Callable[[dict[str, Any]], None],
-    refused: str,
+    short: Path, tmp_path: Path, graph: str, change: Callable[[dict[str, Any]], None], refused: str
 ) -> None:
     for file in short.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
@@ -525,8 +519,8 @@ print(json.dumps([[float(x) for x in outputs[1]] for outputs in (by_onnx, by_tor
 def test_a_robot_needs_no_part_of_this_package(folder: Path) -> None:
     command = [sys.executable, "-W", "ignore", "-I", "-c", ROBOT]
     result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-    level = LowLevel(LOW_POLICY, LOW_CONFIG)
-    wanted = run(level, {s.name: np.full(s.size, 0.3) for s in level.inputs})["joint_targets"]
+    graph = LowGraph(LOW_POLICY, LOW_CONFIG)
+    wanted = run(graph, {s.name: np.full(s.size, 0.3) for s in graph.inputs})["joint_targets"]
     for targets in json.loads(result.stdout):
         assert targets == pytest.approx(wanted, abs=1e-6)
 
@@ -588,7 +582,7 @@ def save_pairs(path: Path) -> None:
         ("--high {low}", "low: not a high policy"),
         ("--high {0}/fast", "commands.vx asks for [-1.0, 1.5], but the low policy was trained on"),
         ("--high {0}/slow", "trained for a low policy with a control step of 0.01 s, not 0.02"),
-        ("--high {0}/blind", "trained for a high policy that observes 48 values, not 86"),
+        ("--high {0}/blind", "trained for a high policy that observes 52 values, not 91"),
         ("--high {0}/high --low {0}/dizzy", "dizzy: its configuration gives "),
         ("--high {0}/forward", "forward: only a recurrent high policy can be exported"),
         ("--high {0}/high --out {0}/file/out", "Not a directory"),
@@ -608,10 +602,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
 
 
 def test_missing_package_names_the_extra(
-    tmp_path: Path,
-    high: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, high: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "onnxscript", None)  # as if it were not installed
     out = tmp_path / "out"

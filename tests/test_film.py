@@ -18,7 +18,7 @@ import evaluate
 from tdgc.benchmark import evaluation
 from tdgc.benchmark.drivers import BaselineDriver
 from tdgc.benchmark.evaluation import Cell, run_cell, tile_of
-from tdgc.benchmark.recording import Recorder, Recording, Together, spans, stretches
+from tdgc.benchmark.recording import Recorder, Recording, spans, stretches
 from tdgc.config import CommandRanges, RobotConfig
 from tdgc.show import film, plots
 from tdgc.sim.commands import default_command
@@ -90,7 +90,7 @@ def test_a_recording_is_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluation, "HORIZON", 0.4)
     low, driver = load_low(PRETRAINED / "low")[0], BaselineDriver()
     cell, notes, recorder = Cell("gp", "nominal", "rough", 9, 0, 3), Notes(), Recorder(driver, 5, 2)
-    watched = run_cell(cell, low, driver, 5, Together([notes, recorder]))
+    watched = run_cell(cell, low, driver, 5, [notes, recorder])
     alone = run_cell(cell, low, BaselineDriver(), 5)
     assert [e.row() for e in watched] == [e.row() for e in alone]
     first, second = recorder.recordings()
@@ -111,7 +111,7 @@ def test_only_the_first_episodes_are_recorded(monkeypatch: pytest.MonkeyPatch) -
     low, driver = load_low(PRETRAINED / "low")[0], BaselineDriver()
     for first, count, numbers in ((0, 1, [0]), (1, 3, [1, 2]), (1, 1, [])):
         recorder = Recorder(driver, 0, count)
-        run_cell(Cell("gp", "nominal", "rough", 0, first, 2), low, driver, 0, recorder)
+        run_cell(Cell("gp", "nominal", "rough", 0, first, 2), low, driver, 0, [recorder])
         assert [r.episode for r in recorder.recordings()] == numbers
 
 
@@ -280,8 +280,8 @@ def test_a_sheet_has_the_bars_that_were_planted(tmp_path: Path) -> None:
 def evaluate_short(out: Path, monkeypatch: pytest.MonkeyPatch, *flags: str) -> int:
     """Two policies, one cell, episodes of 0.1 s, all in this process."""
     monkeypatch.setattr(evaluation, "HORIZON", 0.1)
-    monkeypatch.setattr(evaluate, "spread", lambda work, jobs, workers: map(work, jobs))
-    monkeypatch.setattr(film, "spread", lambda work, jobs, workers: map(work, jobs))
+    monkeypatch.setattr(evaluate, "run_jobs", lambda work, jobs, workers: map(work, jobs))
+    monkeypatch.setattr(film, "run_jobs", lambda work, jobs, workers: map(work, jobs))
     monkeypatch.setattr(film, "ENDING_SECONDS", 0.04)
     small = ["--levels", "10", "--families", "gap", "--episodes", "2", "--workers", "1"]
     return evaluate.main([*small, "--out", str(out), *flags])
@@ -309,7 +309,7 @@ def test_without_an_encoder_all_but_mp4_is_written(
     assert evaluate_short(tmp_path, monkeypatch, "--video", "--policies", "gp") == 1
     lines = capsys.readouterr().err.splitlines()
     assert lines[-1] == (
-        "evaluate.py: MP4 needs PyAV: install the extra 'video', "
+        "evaluate.py: MP4 needs av: install the extra 'video', "
         "pip install -c constraints.txt -e '.[video]'"
     )
     with open(tmp_path / "episodes.csv", newline="", encoding="utf-8") as file:

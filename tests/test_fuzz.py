@@ -555,10 +555,7 @@ def test_traces_of_any_episode(
 
 def test_a_type_that_brings_code_along(folder: Path, traced: tuple[Trace, bytes]) -> None:
     table = pq.read_table(folder / traced[0].file_name)
-    about = {
-        "ARROW:extension:name": "arrow.py_extension_type",
-        "ARROW:extension:metadata": BOMB,
-    }
+    about = {"ARROW:extension:name": "arrow.py_extension_type", "ARROW:extension:metadata": BOMB}
     field = table.schema.field("time")
     field = field.with_metadata({**field.metadata, **about})
     path = folder / "extended.parquet"

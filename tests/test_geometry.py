@@ -14,7 +14,7 @@ import torch as th
 import evaluate
 import train_low
 from tdgc.config import ConfigError, LowLevelConfig, PhysicsConfig, RobotConfig
-from tdgc.export import Pose
+from tdgc.deploy.graphs import Pose
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import PhaseClock, foot_phases, swing_profile
 from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path

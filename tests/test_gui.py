@@ -32,10 +32,7 @@ def test_the_text_says_gait_and_velocities() -> None:
 @pytest.mark.parametrize("display", ["", ":4711"])
 @pytest.mark.parametrize("mode", ["drive", "watch"])
 def test_no_display(
-    mode: str,
-    display: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    mode: str, display: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither one that is not set nor one that is not there."""
     monkeypatch.setattr("sys.platform", "linux")

@@ -13,7 +13,6 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 import tdgc  # noqa: F401  registers the environments
 from tdgc.config import (
     NO_TEACHER,
-    CommandRanges,
     ConfigError,
     HighLevelConfig,
     HighRewardConfig,
@@ -29,6 +28,7 @@ from tdgc.sim.terrain import TILE_SIZE, make_tile
 from tdgc.tasks import rewards
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import (
+    GUIDANCE,
     PRETRAINED,
     SEMANTIC,
     NavigationTask,
@@ -169,8 +169,13 @@ def test_without_a_teacher_standing_at_the_start_does_not_pay():
 
 
 def test_layout_and_cues():
-    sizes = {cues: width(high_layout(cues)) for cues in ("none", "semantic", "geometric", "both")}
-    assert sizes == {"none": 48, "semantic": 54, "geometric": 80, "both": 86}
+    sizes = {
+        cues: width(high_layout(dataclasses.replace(CONFIG, cues=cues)))
+        for cues in ("none", "semantic", "geometric", "both")
+    }
+    assert sizes == {"none": 52, "semantic": 58, "geometric": 85, "both": 91}
+    assert width(high_layout(dataclasses.replace(CONFIG, clock="sine"))) == 87
+    assert width(high_layout(dataclasses.replace(CONFIG, probe_age=False))) == 90
     assert SEMANTIC[-1] == "unknown"
 
 
@@ -235,7 +240,7 @@ def test_the_teachers_episodes_move_no_levels():
 def test_some_robots_in_training_are_not_told_their_family():
     """Of 20 robots of two families the last two of each; in an evaluation all are told."""
     config = dataclasses.replace(CONFIG, families=("tilt", "rough"), unknown_share=0.2)
-    where = columns(high_layout("both"))["family"]
+    where = columns(high_layout(CONFIG))["family"]
     for training, unknown in ((True, [16, 17, 18, 19]), (False, [])):
         task = NavigationTask(config, LOW, 20, seed=0, training=training)
         task.reset(np.arange(20))
@@ -246,7 +251,7 @@ def test_some_robots_in_training_are_not_told_their_family():
 
 
 def test_goal_is_seen_in_the_heading_frame(task):
-    where = columns(high_layout("both"))["goal"]
+    where = columns(high_layout(CONFIG))["goal"]
     task.goal[:] = task.locomotion.world.state.position[:, :2] + [0.0, 2.0]  # due north
     yaw = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2, 0.0])
     xy = task.locomotion.world.state.position[:, :2].copy()
@@ -269,7 +274,7 @@ def test_probes_see_what_is_ahead(task):
     xy = state.position[:, :2].copy()
     task.locomotion.place(np.arange(5), xy, np.zeros(5), np.zeros(5))
     task._probes.begin(np.arange(5))
-    probes = task.observe()[1, columns(high_layout("both"))["probes"]] * 0.5
+    probes = task.observe()[1, columns(high_layout(CONFIG))["probes"]] * 0.5
     standing = state.position[1, 2] - 0.30
     assert probes[row] == pytest.approx(0.3 - standing, abs=1e-6)
     assert probes[near] == pytest.approx(-standing, abs=1e-6)
@@ -285,7 +290,7 @@ def test_sensors_are_noisy_in_training_only(training):
     try:
         task.reset(np.arange(5))
         loco = task.locomotion
-        seen = task.observe()[:, columns(high_layout("both"))["probes"]] * PROBE_RANGE
+        seen = task.observe()[:, columns(high_layout(CONFIG))["probes"]] * PROBE_RANGE
         off = np.abs(seen - height_probes(loco, POINTS))
         assert (off.max() > 0.01) == training and off.max() <= 0.02 + 1e-6
         exact.load_state_dict(loco.state_dict())
@@ -298,8 +303,8 @@ def test_sensors_are_noisy_in_training_only(training):
 
 
 def test_family_is_one_hot(task):
-    family = task.observe()[:, columns(high_layout("both"))["family"]]
-    assert np.array_equal(family, np.eye(6)[:5])
+    family = task.observe()[:, columns(high_layout(CONFIG))["family"]]
+    assert np.array_equal(family, np.eye(6)[[0, 1, 2, 3, 3]])  # twice as many leap
 
 
 def test_a_decision_lasts_five_control_steps(task):
@@ -390,7 +395,7 @@ def test_velocities_alone_leave_the_other_commands_at_their_defaults():
     assert (commands[:, 3:12] == default[3:12]).all()
     assert (np.ptp(commands[:, :3], axis=0) > 1.0).all()
     assert paired(config, low) == config  # as it is read from a policy's file
-    high = CommandRanges(swing_height=(0.19, 0.19))
+    high = dataclasses.replace(low.commands, swing_height=(0.19, 0.19))
     config = paired(HighLevelConfig(behaviour="velocities", commands=high), low)
     assert config.commands.swing_height == (0.19, 0.19)
     assert config.commands.body_height == (0.0, 0.0)  # within the low policy's bounds
@@ -403,8 +408,8 @@ def test_a_teacher_says_what_can_be_said_of_what_it_does():
     task = NavigationTask(config, LOW, 2, seed=0, guided=8, landing=Landing())
     try:
         task.reset(np.arange(2))
-        size = width(high_layout("both"))
-        taught = task.decoder.decode(task.observe()[:, size:].astype(float))
+        size = width(high_layout(CONFIG))
+        taught = task.decoder.decode(task.observe()[:, size : size + 13].astype(float))
         wanted = task.teacher.commands(task.locomotion, task.goal)
         assert (gait_index(wanted) == 1).all() and (gait_index(taught) == 0).all()
         np.testing.assert_allclose(taught[:, :3], wanted[:, :3], atol=1e-6)
@@ -425,13 +430,13 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
     task = NavigationTask(config, LOW, 40, seed=0, guided=8)
     try:
         task.reset(np.arange(40))
-        size = width(high_layout("both"))
-        assert task.observation_space.shape == (size + 13,)
+        size = width(high_layout(CONFIG))
+        assert task.observation_space.shape == (size + GUIDANCE,)
         led = []
         for _ in range(8):
             led.append(task._led.mean())
             leads = task._led.copy()
-            taught = task.observe()[:, size:].astype(float)
+            taught = task.observe()[:, size : size + 13].astype(float)
             commands = task.teacher.commands(task.locomotion, task.goal)
             np.testing.assert_allclose(task.decoder.decode(taught), commands, atol=1e-6)
             _, terminated, truncated = task.step(np.full((40, 13), 0.25))

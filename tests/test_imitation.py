@@ -10,8 +10,10 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from tdgc import policies
-from tdgc.learn.imitation import Apprentice, ApprenticePolicy
-from tdgc.sim.commands import NUM_ACTIONS
+from tdgc.learn.imitation import Apprentice, ApprenticePolicy, expected_price, imitation_loss
+from tdgc.sim.commands import INDEX, NUM_ACTIONS
+from tdgc.tasks.high_env import GUIDANCE
+from tdgc.tasks.leaps import FREQUENCIES
 
 SEEN, ENVS, STEPS = 5, 4, 16
 
@@ -20,7 +22,7 @@ class Lesson(gym.Env):
     """The right action is a share of what was seen one step before, so it takes memory."""
 
     def __init__(self, seed: int) -> None:
-        self.observation_space = spaces.Box(-np.inf, np.inf, (SEEN + NUM_ACTIONS,))
+        self.observation_space = spaces.Box(-np.inf, np.inf, (SEEN + GUIDANCE,))
         self.action_space = spaces.Box(-1.0, 1.0, (NUM_ACTIONS,))
         self.rng = np.random.default_rng(seed)
         self.last = np.zeros(SEEN)
@@ -29,7 +31,7 @@ class Lesson(gym.Env):
         seen = self.rng.uniform(-1.0, 1.0, SEEN)
         taught = np.resize(0.5 * self.last, NUM_ACTIONS)
         self.last = seen
-        return np.concatenate([seen, taught]).astype(np.float32)
+        return np.concatenate([seen, taught, np.zeros(FREQUENCIES)]).astype(np.float32)
 
     def reset(self, *, seed=None, options=None):
         self.last = np.zeros(SEEN)
@@ -62,14 +64,10 @@ def test_an_apprentice_learns_what_it_is_taught_and_keeps_its_noise(apprentice) 
 
     def error() -> float:
         batch = next(apprentice.rollout_buffer.get(STEPS * ENVS))
+        obs = batch.observations
         with th.no_grad():
-            obs = batch.observations
-            _, log_prob, _ = apprentice.policy.evaluate_actions(
-                obs, obs[:, SEEN:], batch.lstm_states, batch.episode_starts
-            )
-        # -log p = e^2 / (2 s^2) + log s + log(2 pi) / 2, summed over the actions
-        constant = NUM_ACTIONS * (-2.0 + 0.5 * np.log(2.0 * np.pi))
-        return float((-log_prob.mean() - constant) * 2.0 * np.exp(-4.0) / NUM_ACTIONS)
+            mean, _ = apprentice.policy.unroll(obs, batch.lstm_states, batch.episode_starts)
+        return float((mean - obs[:, SEEN : SEEN + NUM_ACTIONS]).square().mean())
 
     apprentice.learn(STEPS * ENVS)
     first = error()
@@ -81,8 +79,8 @@ def test_an_apprentice_learns_what_it_is_taught_and_keeps_its_noise(apprentice) 
 
 def test_the_teachers_actions_are_not_seen(apprentice, tmp_path) -> None:
     policy = apprentice.policy
-    obs = th.randn(ENVS, SEEN + NUM_ACTIONS)
-    other = th.cat([obs[:, :SEEN], th.randn(ENVS, NUM_ACTIONS)], dim=1)
+    obs = th.randn(ENVS, SEEN + GUIDANCE)
+    other = th.cat([obs[:, :SEEN], th.randn(ENVS, GUIDANCE)], dim=1)
     starts = th.zeros(ENVS)
     state = apprentice._last_lstm_states
     for a, b in zip(
@@ -97,3 +95,43 @@ def test_the_teachers_actions_are_not_seen(apprentice, tmp_path) -> None:
     expected = policy.forward(obs, state, starts, deterministic=True)[0]
     actions, _ = loaded.predict(obs[:, :SEEN].numpy())
     np.testing.assert_allclose(actions, np.clip(expected.detach().numpy(), -1, 1), atol=1e-6)
+
+
+def guidance(taught: float, price: list[float] | np.ndarray) -> th.Tensor:
+    return th.tensor([*np.full(NUM_ACTIONS, taught), *price], dtype=th.float32)[None]
+
+
+def test_between_two_ways_over_a_trench_a_student_takes_one() -> None:
+    """Frequencies about -0.5 and 0.5 are free and those between them lead into the trench. The
+    teacher takes either as often; the least squares are in the trench, the least loss is not."""
+    grid = np.linspace(-1.0, 1.0, FREQUENCIES)
+    price = np.where(np.abs(np.abs(grid) - 0.5) < 0.2, 0.0, 4.0)
+    both = th.cat([guidance(-0.5, price), guidance(0.5, price)])
+    tried = th.linspace(-1.0, 1.0, 401)
+
+    def loss(frequency: th.Tensor, asked: th.Tensor) -> float:
+        mean = th.zeros(2, NUM_ACTIONS)
+        mean[:, INDEX["frequency"]] = frequency
+        return float(imitation_loss(mean, asked, 1.0).mean())
+
+    free = th.cat([both[:, :NUM_ACTIONS], th.zeros(2, FREQUENCIES)], dim=1)
+    squares = [loss(f, free) for f in tried]
+    assert abs(float(tried[int(np.argmin(squares))])) < 0.01
+    priced = [loss(f, both) for f in tried]
+    assert 0.4 < abs(float(tried[int(np.argmin(priced))])) < 0.6
+
+
+def test_the_price_of_a_frequency() -> None:
+    """Even prices are what they are, a slope keeps its rise, and an action's limit is its scale."""
+    price = th.linspace(0.0, 3.0, FREQUENCIES)[None]
+    even = th.full((1, FREQUENCIES), 2.0)
+    for limit in (1.0, 2.0):
+        asked = th.tensor([0.25 * limit])
+        assert float(expected_price(asked, even, limit)) == pytest.approx(2.0)
+        assert float(expected_price(asked, price, limit)) == pytest.approx(3.0 * 0.625, abs=1e-3)
+
+
+def test_without_a_price_it_is_the_mean_square() -> None:
+    mean = th.full((1, NUM_ACTIONS), 0.3)
+    loss = imitation_loss(mean, guidance(0.1, np.zeros(FREQUENCIES)), 1.0)
+    assert float(loss) == pytest.approx(0.04)

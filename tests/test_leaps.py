@@ -8,51 +8,80 @@ from tdgc.sim.robot import Array
 from tdgc.sim.terrain import make_tile
 from tdgc.tasks.high_env import PRETRAINED, load_low
 from tdgc.tasks.leaps import (
+    FREQUENCIES,
+    SPEED,
     STRIDE,
     Landing,
     LeapPlan,
+    Motion,
     foothold_risk,
+    lead,
     leap_command,
     measure_landing,
+    speed_up,
 )
 
 LOW = PRETRAINED / "low"
 RANGES = CommandRanges()
-LANDING = Landing(0.22, 0.01)
+LANDING = Landing(-0.02, 0.08)
 
 
-def land(trenches: Array, clock: float = 0.0, x: float = 0.75) -> tuple[list[float], list[float]]:
-    """Places of front and rear feet of a point that leaps at 1 m/s, decided ten times a second."""
+def land(
+    trenches: Array, clock: float = 0.0, x: float = 0.75, choice: str = "steps"
+) -> tuple[list[float], list[float]]:
+    """Places of front and rear feet of a point that leaps at SPEED, decided ten times a second.
+
+    It is asked for a little more, as low policies fall short of what they are asked for.
+    """
     plan = LeapPlan(1, RANGES)
     plan.look(0, trenches, LANDING.spread)
     one, front, rear, length = np.ones(1), [], [], STRIDE
-    frequency = 2.5
-    for step in range(330):
+    frequency = SPEED / STRIDE
+    for step in range(275):
         if step % 5 == 0:
             row = np.zeros(1, dtype=int)
-            f, wanted = plan.steps(row, x * one, one, clock * one, LANDING)
+            motion = Motion(x * one, SPEED * one, SPEED / 0.95 * one, clock * one)
+            f, wanted = getattr(plan, choice)(row, motion, LANDING)[:2]
             frequency, length = float(f[0]), float(wanted[0])
-        x, clock = x + 0.02, clock + 0.02 * frequency
+        x, clock = x + 0.02 * SPEED, clock + 0.02 * frequency
         if clock >= 1.0:
             clock -= 1.0
-            front.append(x - clock / frequency + LANDING.front)
+            trunk = x - SPEED * clock / frequency
+            foothold = trunk + 0.5 * length + float(lead(SPEED * one, frequency * one)[0])
+            front.append(foothold + LANDING.front)
             rear.append(front[-1] - length - LANDING.spread)
     return front, rear
 
 
+@pytest.mark.parametrize("choice", ["steps", "lesson"])
 @pytest.mark.parametrize("level", [4, 8, 10])
-def test_planned_landings_miss_the_trenches(level: int) -> None:
+def test_planned_landings_miss_the_trenches(level: int, choice: str) -> None:
     """Of 20 tiles a level, from any phase of the gait: all feet at least 1 cm from each lip, but
     for one landing in a hundred."""
     feet = []
     for seed in range(20):
         trenches = make_tile("gap", level / 10, np.random.default_rng(seed)).features.trenches
-        front, rear = land(trenches, clock=seed / 20)
+        front, rear = land(trenches, clock=seed / 20, choice=choice)
         places = np.array([*front, *rear])[:, None]
         away = np.maximum(trenches[:, 0] - places, places - trenches[:, 1]).min(axis=1)
         feet += [away]
     away = np.concatenate(feet)
     assert np.mean(away < 0.01) < 0.01 and len(away) > 500
+
+
+def test_speeding_up() -> None:
+    """From rest to 95 % of 1.2 m/s, two thirds of it in 0.3 s; what is faster stays so."""
+    speed = np.array([0.0, 1.14, 1.3])
+    way, then = speed_up(speed, 1.2, 0.3)
+    np.testing.assert_allclose(then, [1.14 * (1 - np.exp(-1.0)), 1.14, 1.3])
+    np.testing.assert_allclose(way[1:], 0.3 * speed[1:])
+    _, nearly = speed_up(speed, 1.2, 3.0)
+    np.testing.assert_allclose(nearly, [1.14, 1.14, 1.3], atol=1e-3)
+    steps, v = 0.0, np.zeros(1)  # the way is what ever smaller steps sum up to
+    for _ in range(300):
+        _, after = speed_up(v, 1.2, 0.001)
+        steps, v = steps + 0.001 * 0.5 * (v[0] + after[0]), after
+    assert way[0] == pytest.approx(steps, abs=1e-5)
 
 
 def test_without_trenches_strides_are_the_usual_ones() -> None:
@@ -72,8 +101,43 @@ def test_a_slow_robot_is_timed_for_the_speed_of_a_leap() -> None:
     """At 2 Hz from rest robots are thrown down."""
     plan = LeapPlan(1, RANGES)
     one, row = np.ones(1), np.zeros(1, dtype=int)
-    frequency, _ = plan.steps(row, one, 0.1 * one, 0.0 * one, LANDING)
-    assert frequency[0] == pytest.approx(1.0 / STRIDE, abs=0.05)
+    motion = Motion(one, 0.1 * one, SPEED * one, 0.0 * one)
+    frequency, _ = plan.steps(row, motion, LANDING)
+    assert frequency[0] == pytest.approx(SPEED / STRIDE, abs=0.05)
+
+
+def test_what_is_imitated_depends_smoothly_on_the_speed() -> None:
+    """Best stance lengths jump; over speeds 1 cm/s apart the squares of the smooth ones' changes
+    are half as large, and of frequencies about as large."""
+    trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
+    plan, speeds = LeapPlan(1, RANGES), np.arange(0.9, 1.3, 0.01)
+    plan.look(0, trenches, LANDING.spread)
+    rows, one = np.zeros(len(speeds), dtype=int), np.ones(len(speeds))
+    changes = [
+        [
+            np.diff(choose(rows, Motion(x * one, speeds, SPEED * one, 0.3 * one), LANDING)[:2]) ** 2
+            for x in trenches[0, 0] - [0.3, 0.5, 0.7]
+        ]
+        for choose in (plan.steps, plan.lesson)
+    ]
+    best, smooth = (np.mean(each, axis=(0, 2)) for each in changes)  # of frequency and length
+    assert smooth[1] < 0.5 * best[1] and smooth[0] < 1.1 * best[0]
+
+
+def test_prices_of_frequencies() -> None:
+    """What the teacher does costs next to nothing, and in front of a trench some cost a fall."""
+    trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
+    plan = LeapPlan(1, RANGES)
+    plan.look(0, trenches, LANDING.spread)
+    x = np.arange(0.8, trenches[-1, 0], 0.01)
+    rows, one = np.zeros(len(x), dtype=int), np.ones(len(x))
+    taught = plan.lesson(rows, Motion(x, SPEED * one, SPEED * one, 0.2 * one), LANDING)
+    assert taught.price.shape == (len(x), FREQUENCIES)
+    np.testing.assert_array_equal(taught.price.min(axis=1), 0.0)
+    grid = np.linspace(*RANGES.frequency, FREQUENCIES)
+    own = [np.interp(f, grid, p) for f, p in zip(taught.frequency, taught.price, strict=True)]
+    assert np.percentile(own, 90) < 0.1
+    assert np.mean(taught.price.max(axis=1) > 1.0) > 0.5
 
 
 def test_the_command_of_a_leap() -> None:
@@ -88,7 +152,7 @@ def test_the_command_of_a_leap() -> None:
 def test_landing_of_the_shipped_low_policy() -> None:
     found = measure_landing(*load_low(LOW))
     assert found is not None
-    assert 0.15 < found.front < 0.30 and -0.03 < found.spread < 0.12
+    assert -0.08 < found.front < 0.02 and -0.03 < found.spread < 0.12
     assert found != Landing()
 
 

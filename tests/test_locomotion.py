@@ -28,7 +28,7 @@ NOMINAL = nominal_pose(ROBOT)
 CONVERGED = PhysicsConfig(solver_iterations=300)
 
 
-ACTOR = columns(actor_layout(gyro=True))
+ACTOR = columns(actor_layout(ROBOT, gyro=True))
 
 
 def standing(num: int = 1, gyro: bool = False, physics: PhysicsConfig = PHYSICS) -> Locomotion:
@@ -54,27 +54,31 @@ def quaternion(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def test_layout() -> None:
-    assert [f"{term.name} {term.size}" for term in actor_layout(gyro=True)] == [
-        "gravity 3", "joint_error 12", "joint_speed 12", "last_action 12", "action_before 12",
-        "command 15", "clock 4", "gait 1", "gyro 3",
+    assert [f"{term.name} {term.size}" for term in actor_layout(ROBOT, gyro=True)] == [
+        "gravity 3", "joint_error 12", "pose 12", "joint_speed 12", "last_action 12",
+        "action_before 12", "command 15", "clock 4", "clock_cosine 4", "gait 1", "gyro 3",
     ]  # fmt: skip
-    assert actor_layout(gyro=False) == actor_layout(gyro=True)[:-1]
-    assert width(actor_layout(gyro=False)) == 71
-    assert list(ACTOR.values())[-3:] == [slice(66, 70), slice(70, 71), slice(71, 74)]
+    assert actor_layout(ROBOT, gyro=False) == actor_layout(ROBOT, gyro=True)[:-1]
+    assert width(actor_layout(ROBOT, gyro=False)) == 87
+    papers = actor_layout(dataclasses.replace(ROBOT, commanded_gait=False), gyro=False)
+    assert width(papers) == 71 and not {"pose", "clock_cosine"} & {term.name for term in papers}
+    assert list(ACTOR.values())[-3:] == [slice(82, 86), slice(86, 87), slice(87, 90)]
     without = standing()
-    assert without.layout == actor_layout(gyro=False)
-    assert without.observe().shape == (1, 71)
+    assert without.layout == actor_layout(ROBOT, gyro=False)
+    assert without.observe().shape == (1, 87)
     assert without.observe().dtype == np.float32
     without.world.close()
 
 
 def test_observation_of_a_robot_that_stands(loco: Locomotion) -> None:
     seen = loco.observe()
-    assert seen.shape == (2, 74)
-    assert loco.layout == actor_layout(gyro=True)
-    expected = np.zeros(74)
+    assert seen.shape == (2, 90)
+    assert loco.layout == actor_layout(ROBOT, gyro=True)
+    expected = np.zeros(90)
     expected[2] = -1.0
-    expected[ACTOR["joint_error"]] = (NOMINAL - loco.pose())[0]
+    expected[ACTOR["pose"]] = (loco.pose() - NOMINAL)[0]
+    expected[ACTOR["joint_error"]] = -expected[ACTOR["pose"]]
+    expected[ACTOR["clock_cosine"]] = [-1.0, 1.0, 1.0, -1.0]
     expected[ACTOR["command"]] = observed_command(loco.executed()[0])
     np.testing.assert_allclose(seen, np.stack([expected] * 2), atol=1e-7)
 
@@ -130,6 +134,10 @@ def test_command_clock_and_gait(loco: Locomotion) -> None:
     sine = math.sin(0.2 * math.pi)
     np.testing.assert_allclose(seen[0, ACTOR["clock"]], [-sine, -sine, sine, sine], atol=1e-6)
     np.testing.assert_allclose(seen[1, ACTOR["clock"]], [-1.0, 1.0, -1.0, 1.0], atol=1e-6)
+    cosine = math.cos(0.2 * math.pi)
+    wanted = [-cosine, -cosine, cosine, cosine]
+    np.testing.assert_allclose(seen[0, ACTOR["clock_cosine"]], wanted, atol=1e-6)
+    np.testing.assert_allclose(seen[1, ACTOR["clock_cosine"]], 0.0, atol=1e-6)
     np.testing.assert_allclose(seen[:, ACTOR["gait"]], [[1.0], [2.0 / 3.0]], atol=1e-6)
     wanted = observed_command(loco.executed())
     np.testing.assert_allclose(seen[:, ACTOR["command"]], wanted, atol=1e-6)
@@ -327,7 +335,7 @@ ALL = Flip(MIRROR.obs_index, MIRROR.obs_sign)
 
 def test_mirroring_twice_is_nothing() -> None:
     assert Flip(MIRROR.action_index, MIRROR.action_sign) == JOINTS
-    for flip, size in ((ALL, 114), (JOINTS, 12)):
+    for flip, size in ((ALL, 130), (JOINTS, 12)):
         x = np.random.default_rng(0).normal(size=(3, size))
         assert mirrored(x, flip).shape == x.shape
         assert (mirrored(mirrored(x, flip), flip) == x).all()
@@ -446,3 +454,24 @@ def test_phases_follow_the_clock_of_a_placed_robot() -> None:
         loco.clock.phases, [[0.6, 0.1, 0.1, 0.6], [0.85, 0.35, 0.35, 0.85]], atol=1e-12
     )
     loco.world.close()
+
+
+@pytest.mark.parametrize(
+    ("walks", "lowest", "highest"), [(True, 0.025, 0.10), (False, -1e-4, 0.015)]
+)
+def test_feet_rise_without_a_policy_only_where_the_pose_carries_the_robot(
+    walks: bool, lowest: float, highest: float
+) -> None:
+    """Asked for 8 cm in trot at 2.5 Hz, in its second and third cycle."""
+    made = Locomotion(1, dataclasses.replace(ROBOT, commanded_gait=walks), PHYSICS, None)
+    made.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+    made.command[:, INDEX["frequency"]] = 2.5
+    risen = []
+    for _ in range(56):
+        made.act(np.zeros((1, 12)))
+        risen.append(
+            made.world.state.foot_position[0, :, 2] - made.world.state.geometry.foot_radius
+        )
+    made.world.close()
+    apex = np.max(risen[16:], axis=0)
+    assert (apex >= lowest).all() and (apex <= highest).all()

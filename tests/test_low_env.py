@@ -20,6 +20,7 @@ from tdgc.sim.observation import columns, width
 from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import make_tile, tile_rng
 from tdgc.state import State, split
+from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_spaces
@@ -66,7 +67,7 @@ def test_the_registered_environment() -> None:
     env = gym.make("tdgc/LowLevel-v0")
     assert isinstance(env.unwrapped, LowLevelEnv)
     assert env.unwrapped.config == LowLevelConfig()
-    assert env.observation_space.shape == (114,) and env.observation_space.dtype == np.float32
+    assert env.observation_space.shape == (130,) and env.observation_space.dtype == np.float32
     assert isinstance(env.action_space, gym.spaces.Box)
     assert env.action_space.low.tolist() == [-4.0] * 12
     assert env.action_space.high.tolist() == [4.0] * 12
@@ -103,18 +104,18 @@ def test_observation_of_actor_and_critic() -> None:
     """Sizes follow from the terms, without a robot."""
     assert width(CRITIC_LAYOUT) == 40
     without = low_spaces(dataclasses.replace(PLANE, gyro=False))[0]
-    assert without.shape == (111,)
+    assert without.shape == (127,)
     task = LowLevelTask(PLANE, 3, seed=0)
     assert (task.observation_space, task.action_space) == low_spaces(PLANE)
     task.reset(np.arange(3))
-    assert task.observe().shape == (3, 114) and task.observe().dtype == np.float32
+    assert task.observe().shape == (3, 130) and task.observe().dtype == np.float32
     task.close()
 
 
 def test_only_the_actor_has_noise_and_only_in_training() -> None:
     task = begin(PLANE, 2, training=True)
     first, second = task.observe(), task.observe()
-    measured = np.r_[:27, 71:74]  # gravity, joints and gyro
+    measured = np.r_[:15, 27:39, 87:90]  # gravity, joint angles and speeds, gyro
     assert (first[:, measured] != second[:, measured]).all()
     assert (np.delete(first, measured, 1) == np.delete(second, measured, 1)).all()
     task.close()
@@ -199,6 +200,7 @@ def test_reward_of_a_step_is_that_of_its_terms() -> None:
     pose = task.locomotion.pose().copy()
     before = task.locomotion.world.state.qd.copy()
     actions = np.random.default_rng(0).normal(size=(2, 12))
+    actions[:, 2::3] = -np.abs(actions[:, 2::3])  # calves bend, away from their nearer limit
     reward, _, _ = task.step(actions)
     stats, weights = task.take_stats(), PLANE.rewards
     terms = {key[5:]: value for key, value in stats.items() if key.startswith("term/")}
@@ -528,8 +530,9 @@ def test_a_new_level_is_a_new_tile() -> None:
     for _ in range(25):
         task.step(still(task))
     state = task.locomotion.world.state
-    assert (state.foot_force[1] > 1.0).any()
-    assert state.foot_position[1, :, 2].max() == pytest.approx(0.114 * up + 0.022, abs=5e-3)
+    stands = state.foot_force[1] > 1.0
+    assert stands.any()
+    assert state.foot_position[1, stands, 2].max() == pytest.approx(0.114 * up + 0.022, abs=5e-3)
     task.close()
 
 
@@ -576,6 +579,14 @@ def test_penalties_count_least_on_relief() -> None:
     assert share == pytest.approx(0.4 / 0.5, rel=1e-6)  # commands are whole outside training
 
 
+def test_leaps_grow_as_fast_as_pronk_does() -> None:
+    task = begin(dataclasses.replace(TILES, families=("gap",)), 400, training=True)
+    assert task.commands.share[PRONK] == 0.4  # as training begins
+    speed = task.episodes.speed[task.episodes.leaping]
+    assert 0.4 <= speed.min() and speed.max() <= 0.48
+    task.close()
+
+
 def test_most_crossings_of_trenches_leap() -> None:
     task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 400)
     pronks = (gait_index(task.locomotion.command) == 1) & task.episodes.crossing
@@ -585,14 +596,16 @@ def test_most_crossings_of_trenches_leap() -> None:
     assert 0.75 < leaps[gap & task.episodes.crossing].mean() < 0.95
     assert (task.episodes.facing[leaps] == 0.0).all()
     command = task.locomotion.command[leaps]
-    # From rest they are timed for 1 m/s and strides of 0.39 m.
-    np.testing.assert_allclose(command[:, INDEX["frequency"]], 1.0 / 0.39, atol=0.05)
+    # From rest about as for strides of 0.39 m at 1.2 m/s, and never at the slow end of 2 Hz.
+    frequency = command[:, INDEX["frequency"]]
+    assert frequency.min() > 2.4 and np.median(frequency) == pytest.approx(1.2 / 0.39, abs=0.2)
+    assert (command[:, INDEX["duration"]] == 0.5).all()
     assert (command[:, INDEX["swing_height"]] <= 0.07).all()
     speed = np.hypot(*command[:, :2].T)
     # Sideways to the goal, but facing across the trenches.
     turn, yaw = command[:, INDEX["yaw_rate"]], task.locomotion.world.state.yaw[leaps]
     np.testing.assert_allclose(turn, -yaw, atol=1e-9)
-    assert speed.min() > 0.5 and speed.max() <= 1.0 + 1e-9
+    assert speed.min() > 0.5 and speed.max() <= 1.2 + 1e-9
     task.close()
 
 
@@ -601,9 +614,9 @@ def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> 
     names = ("swing_height", "body_height", "pitch", "vx")
     columns = [INDEX[name] for name in names]
     for level, bounds in (
-        (0, [(0.08, 0.24), (-0.03, 0.05), (-0.3, 0.3), (-1.0, 1.0)]),
-        (5, [(0.13, 0.24), (-0.015, 0.05), (-0.195, 0.195), (-1.0, 1.0)]),
-        (10, [(0.18, 0.24), (0.0, 0.05), (-0.09, 0.09), (-1.0, 1.0)]),
+        (0, [(0.08, 0.24), (-0.03, 0.05), (-0.3, 0.3), (-1.0, 1.2)]),
+        (5, [(0.13, 0.24), (-0.015, 0.05), (-0.195, 0.195), (-1.0, 1.2)]),
+        (10, [(0.18, 0.24), (0.0, 0.05), (-0.09, 0.09), (-1.0, 1.2)]),
     ):
         task.level[:], task.episodes.crossing[:] = level, [True, False]
         wide = task.commands.bounds(2)
@@ -777,13 +790,16 @@ def test_a_checkpoint_names_what_it_holds() -> None:
     episodes = state.pop("episodes")
     for part in ("locomotion", "tiles"):
         assert episodes.pop(part)
-    assert set(state) == {"rng", "landing", "tiles_drawn", "level", "command_share"}
+    assert set(state) == {"rng", "landing", "tiles_drawn", "level", "command_share", "falls"}
     assert len(state["landing"]) == 2 and state["command_share"].shape == (4,)
+    assert state["falls"].shape == (256, 13)
     held = {name: f"{array.dtype} {array.shape}" for name, array in episodes.items()}
     whole, flags, numbers = "int64 (3,)", "bool (3,)", "float64 (3,)"
     assert held == {
         "elapsed": whole, "began": whole, "next_push": whole,
-        "crossing": flags, "leaping": flags, "reached": flags, "was_contact": "bool (3, 4)",
+        "tilts": "float64 (3, 26, 2)",
+        "crossing": flags, "leaping": flags, "reached": flags, "retried": flags,
+        "was_contact": "bool (3, 4)",
         "speed": numbers, "follow": numbers, "pitch": numbers, "facing": numbers,
         "waypoint": "float64 (3, 2)", "origin": "float64 (3, 2)", "gait_scores": "float64 (4, 4)",
     }  # fmt: skip
@@ -799,6 +815,7 @@ def test_new_episodes_begin_from_a_state_without_any() -> None:
     old = {
         "rng": state["rng"], "tiles_drawn": 0, "landing": state["landing"],
         "level": state["level"].tolist(), "command_share": state["command_share"].tolist(),
+        "falls": state["falls"].tolist(),
     }  # fmt: skip
     other.load_state_dict(json.loads(json.dumps(old)))
     task.restart()
@@ -829,7 +846,7 @@ def test_restart_draws_new_tiles_at_the_present_levels() -> None:
 
 
 def test_restart_spreads_the_ends_of_episodes() -> None:
-    task = LowLevelTask(PLANE, 10, seed=0)
+    task = LowLevelTask(PLANE, 20, seed=0)
     task.restart()
     assert task.episodes.elapsed.min() < 250 and task.episodes.elapsed.max() > 750
     assert (task.episodes.began == task.episodes.elapsed).all()
@@ -844,3 +861,30 @@ def test_seeds_differ() -> None:
     assert (first.observe() != second.observe()).any()
     first.close()
     second.close()
+
+
+def test_tilt_a_gait_cycle_ago() -> None:
+    """At 2.5 Hz a cycle is 20 control steps, at 3 Hz 16 2/3, between two steps."""
+    task = LowLevelTask(LowLevelConfig(), 2, seed=0, training=False)
+    try:
+        steps = np.arange(1.0, 1.0 + task.episodes.tilts.shape[1])
+        task.episodes.tilts[:, :, 0] = 0.01 * steps  # grows with age
+        ago = task._last_tilt(np.array([2.5, 3.0]))
+        np.testing.assert_allclose(ago, [[0.20, 0.0], [0.01 * 50 / 3, 0.0]], atol=1e-12)
+    finally:
+        task.close()
+
+
+def test_tilts_are_remembered_step_by_step() -> None:
+    task = LowLevelTask(LowLevelConfig(), 1, seed=0, training=False)
+    try:
+        task.reset(np.arange(1))
+        seen = []
+        for _ in range(4):
+            task.step(np.full((1, 12), 0.3))
+            seen.append(task.locomotion.world.state.gravity[0, :2].copy())
+        np.testing.assert_array_equal(task.episodes.tilts[0, :4], seen[::-1])
+        assert not task.episodes.tilts[0, 4:].any()  # before the episode it stood upright
+        assert np.ptp(seen, axis=0).max() > 1e-4
+    finally:
+        task.close()

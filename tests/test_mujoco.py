@@ -222,7 +222,7 @@ def run(controller: Controller, family: str, **settings: float) -> tuple[trace.T
     pair = runner.Deployed(controller, LogWriter(controller))
     assert pair.log is not None
     watcher, cell = Tracer(pair, 0), Cell("tdgc", "nominal", family, 6, 0, 1)
-    runner.run_episode(cell, pair, MujocoConfig(**settings), 0, watcher)  # type: ignore[arg-type]
+    runner.run_episode(cell, pair, MujocoConfig(**settings), 0, [watcher])  # type: ignore[arg-type]
     return watcher.traces()[0], pair.log
 
 
@@ -518,7 +518,8 @@ def test_documents_name_what_there_is(
 ) -> None:
     settings = [field.name for field in dataclasses.fields(MujocoConfig)]
     assert first_cells("mujoco.md", "Physics") == settings
-    assert set(first_cells("deploy.md", "Logs")) == {"time", *log.layout(controller)}
+    logged = {"time", *log.layout(controller), "probe_age"}  # which the first policies do not take
+    assert set(first_cells("deploy.md", "Logs")) == logged
     with pytest.raises(SystemExit):
         runner.main(["--help"])
     flags = re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, flags=re.MULTILINE)

@@ -18,13 +18,15 @@ from test_structure import DOORS, FLOOR
 import evaluate
 import train_high
 import train_low
-from tdgc import bench, calibration, diagnose, export, mujoco, policies
+from tdgc import bench, calibration, diagnose, export, mujoco
 from tdgc.ablate import __main__ as ablate
 from tdgc.benchmark.evaluation import CONDITIONS
+from tdgc.config import HighLevelConfig, RobotConfig
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
+from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.terrain import ALL_FAMILIES, PARAMETER_RANGES
-from tdgc.tasks.high_env import PRETRAINED
+from tdgc.tasks.high_env import high_layout
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -71,8 +73,7 @@ CHAINS: tuple[dict[str, Run], ...] = (
             ),
         ),
         "python train_low.py --resume --time-limit 3600": Run(
-            "--steps 256",
-            ("runs/low/policy.safetensors", "runs/low/checkpoints/step-000000000256"),
+            "--steps 256", ("runs/low/policy.safetensors", "runs/low/checkpoints/step-000000000256")
         ),
         "tensorboard --logdir runs": Run("--inspect --logdir runs/low", ()),
         "python train_high.py --low runs/low/policy": Run(
@@ -146,7 +147,7 @@ CHAINS: tuple[dict[str, Run], ...] = (
     {
         "python -m tdgc.bench --out runs/bench": Run(
             "--robots 2 --workers 1 --seconds 0.1", ("runs/bench/bench.json",)
-        ),
+        )
     },
 )
 RUNS = {command: run for chain in CHAINS for command, run in chain.items()}
@@ -331,9 +332,11 @@ def test_gaits_are_the_codes() -> None:
         assert decoder.gait([0.0] * 12 + [ends[0]]) == GAITS.index(name)
 
 
-def test_observations_are_as_wide_as_the_policies() -> None:
-    for table, name in zip(tables("commands.md", "Observations"), ("low", "high"), strict=True):
-        assert sum(map(int, column(table, 1))) == policies.load(PRETRAINED / name).actor_dim
+def test_observations_are_those_of_the_layouts() -> None:
+    layouts = actor_layout(RobotConfig(), gyro=True), high_layout(HighLevelConfig())
+    for table, layout in zip(tables("commands.md", "Observations"), layouts, strict=True):
+        found = [(row[0], int(row[1])) for row in table]
+        assert sorted(found) == sorted((term.name, term.size) for term in layout)
 
 
 def test_families_are_the_terrains() -> None:

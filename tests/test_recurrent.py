@@ -10,12 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from tdgc import policies
-from tdgc.learn.recurrent import (
-    FastRecurrentPolicy,
-    FastRecurrentPPO,
-    GaitNoise,
-    gait_entropy,
-)
+from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, gait_entropy
 from tdgc.policies import Mirror
 from tdgc.sim.commands import CommandDecoder
 

@@ -202,7 +202,7 @@ def test_films_are_named_as_recordings_are() -> None:
 
 
 def test_every_condition_but_nominal_changes_something_of_its_own() -> None:
-    texts = {name: report.describe_condition(c) for name, c in CONDITIONS.items()}
+    texts = {name: c.what for name, c in CONDITIONS.items()}
     assert [name for name, text in texts.items() if text == "nothing"] == ["nominal"]
     assert len(set(texts.values())) == len(CONDITIONS)
     assert texts["latency-30ms"] == "commands reach the joints 30 ms late"

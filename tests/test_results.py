@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -103,6 +104,25 @@ def test_the_summary_has_the_differences_beside_the_policies(tmp_path: Path) -> 
     assert summary["paired"] == {"tdgc - gp": compare(EPISODES, "tdgc", "gp")}
     write_results(tmp_path, [e for e in EPISODES if e.policy == "gp"])
     assert list(json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))) == ["gp"]
+
+
+def test_mirror_images_are_compared_with_their_tiles(tmp_path: Path) -> None:
+    tilt = rows("tdgc", "tilt", [True, True, True, False])
+    images = [
+        dataclasses.replace(e, condition="mirrored", outcome=outcome)
+        for e, outcome in zip(tilt, ("reached", "fell", "fell"), strict=False)
+    ]
+    rough = rows("tdgc", "rough", [True])
+    images.append(dataclasses.replace(rough[0], condition="mirrored"))
+    found = write_results(tmp_path, [*images, *rough, *tilt])
+    assert list(found["sides"]) == ["tdgc"]
+    assert list(found["sides"]["tdgc"]) == ["tilt", "rough", "mean"]
+    one = found["sides"]["tdgc"]["tilt"]  # of the tiles that have an image
+    assert (one["n"], one["gained"], one["lost"]) == (3, 0, 2)
+    assert found["sides"]["tdgc"]["mean"]["difference"] == pytest.approx(-0.5)
+    lines = describe(found).splitlines()
+    at = lines.index("tdgc on mirrored tiles - on the tiles")
+    assert lines[at + 1].split()[:2] == ["tilt", "-66.7"]
 
 
 def test_the_table_says_which_edition_a_policy_was_trained_on(tmp_path: Path) -> None:

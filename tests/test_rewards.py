@@ -42,6 +42,7 @@ def low_step(**changes: object) -> LowStep:
         targets=np.zeros((3, 2, 12)),
         actions=np.zeros((2, 2, 12)),
         acceleration=np.zeros((2, 12)),
+        last_tilt=np.zeros((2, 2)),
         was_contact=np.zeros((2, 4), dtype=bool),
         sigma_lin=0.25,
         sigma_yaw=0.25,
@@ -136,6 +137,12 @@ def test_vertical_velocity_and_tilt_rate() -> None:
     step.state.ang_vel[1] = [0.3, -0.4, 5.0]
     np.testing.assert_allclose(rewards.vertical_velocity(step), [0.0, 0.25], atol=1e-12)
     np.testing.assert_allclose(rewards.tilt_rate(step), [0.0, 0.25], atol=1e-12)
+    # Level a gait cycle ago as now; then nose up by 0.1 rad where it is nose down by 0.2 now.
+    np.testing.assert_allclose(rewards.nodding(step), [0.0, 0.0], atol=1e-12)
+    before = np.array([[0.0, 0.0], [-math.sin(0.1), 0.0]])
+    nods = turn(low_step(last_tilt=before), 0.0, 0.2, 0.0)
+    change = (math.sin(0.2) + math.sin(0.1)) ** 2
+    np.testing.assert_allclose(rewards.nodding(nods), [0.0, change], atol=1e-12)
     # Rolled onto its left side, what turns about the world's z turns about the body's y.
     turn(step, math.pi / 2, 0.0, 0.0)
     np.testing.assert_allclose(rewards.tilt_rate(step), [0.0, 0.09 + 25.0], atol=1e-9)

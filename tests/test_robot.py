@@ -24,6 +24,7 @@ from tdgc.sim.robot import (
     joint_targets,
     leg_angles,
     load_torque,
+    nominal_height,
     nominal_pose,
     pd_torque,
     quaternion_product,
@@ -301,7 +302,10 @@ def test_walking_pose_puts_feet_where_commands_say() -> None:
     wider = 0.5 * (0.3 - default_command()[INDEX["stance_width"]])
     rest = rest + [[[0.0, wider, 0.0], [0.0, -wider, 0.0]] * 2]
     moved = feet - rest
-    np.testing.assert_allclose(moved[..., 2], 0.06 * swing_profile(ahead), atol=1e-9)
+    # At 0.30 m, where the nominal pose without its load would stand at 0.324 m.
+    lift = nominal_height(CONFIG, GEOMETRY) - 0.30
+    assert lift == pytest.approx(0.0238, abs=1e-4)
+    np.testing.assert_allclose(moved[..., 2], lift + 0.06 * swing_profile(ahead), atol=1e-9)
     lead = 0.5 * (np.abs(1.0 - 2.0 * ahead) - 0.5) / 6.0  # s, half of a stance of 1/6 s
     np.testing.assert_allclose(moved[..., 0], lead * (0.5 - 0.6 * rest[..., 1]), atol=1e-9)
     np.testing.assert_allclose(moved[..., 1], lead * (-0.2 + 0.6 * rest[..., 0]), atol=1e-9)

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 #: From the ground up: rooms (folders) and modules that stand in none. A module imports from lower
 #: floors and from its own room only, so rooms on the same floor know nothing of each other.
 FLOORS = (
-    ("tdgc", "errors", "state"),
+    ("tdgc", "errors", "files", "state"),
     ("config",),
     ("policies", "sim", "parallel"),
     ("tasks",),

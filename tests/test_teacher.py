@@ -78,9 +78,29 @@ def test_each_family_is_walked_in_its_style(course) -> None:
         swing = SWING_HEIGHT if family == "gap" else style.swing_height
         assert row[INDEX["swing_height"]] == swing
         assert row[INDEX["stance_width"]] == style.stance_width
+        assert row[INDEX["body_height"]] == style.body_height
         assert gait_index(row) == (1 if family == "gap" else 0)
     decoder = CommandDecoder()  # all of it can be said in actions
     np.testing.assert_allclose(decoder.decode(decoder.encode(commands)), commands)
+
+
+def test_goes_uphill_across_a_slope(course) -> None:
+    course = course(["tilt", "rough"])
+    slope = course.field.features[0, 0].slope
+    climb = STYLES["tilt"].uphill * np.sin(slope)
+    assert abs(climb) > 0.1
+    for yaw in (0.0, 0.3):
+        course.put(1.0, yaw=yaw)
+        command = course.commands()[0]
+        ahead = STYLES["tilt"].speed * np.cos(yaw)
+        assert command[INDEX["vx"]] == pytest.approx(ahead + climb * np.sin(yaw))
+        assert command[INDEX["vy"]] == pytest.approx(climb * np.cos(yaw))
+    course.put(1.0)
+    left, right = course.loco.world.ground_height(
+        np.repeat(course.origin[:1, 0] + 4.0, 2), course.origin[0, 1] + np.array([5.0, 3.0])
+    )
+    assert np.sign(climb) == np.sign(left - right)
+    assert course.commands()[1, INDEX["vy"]] == 0.0  # level ground
 
 
 def test_turns_to_the_goal_and_slows_before_it(course) -> None:
@@ -100,8 +120,8 @@ def test_leaps_face_across_the_trenches_and_end_behind_them(course) -> None:
     command = course.commands()[0]
     bearing = np.arctan2(0.8, 7.25 - 1.2)
     assert gait_index(command) == 1
-    assert command[INDEX["vx"]] == pytest.approx(np.cos(bearing))
-    assert command[INDEX["vy"]] == pytest.approx(np.sin(bearing))
+    assert command[INDEX["vx"]] == pytest.approx(1.2 * np.cos(bearing))
+    assert command[INDEX["vy"]] == pytest.approx(1.2 * np.sin(bearing))
     assert command[INDEX["yaw_rate"]] == pytest.approx(-0.3)
     course.put(course.field.features[0, 0].trenches[-1, 1] + 0.55)
     command = course.commands()

@@ -12,8 +12,8 @@ from tdgc.sim.terrain import (
     EVAL_STREAM,
     FAMILIES,
     TRAIN_STREAM,
-    TerrainGrid,
     Tile,
+    TileField,
     difficulty_parameter,
     draw_start_goal,
     make_tile,
@@ -298,6 +298,26 @@ def test_pillars_are_where_the_tile_says():
     np.testing.assert_array_equal(made.heights > 0, (away <= 1e-12).any(axis=-1))
 
 
+@pytest.mark.parametrize(("family", "difficulty"), [("pillar", 1), ("tilt", 0.5), ("mixed", 0.8)])
+def test_a_mirrored_tile_has_left_and_right_exchanged(family, difficulty):
+    made = tile(family, difficulty)
+    turned = made.mirrored()
+    np.testing.assert_array_equal(turned.heights, made.heights[:, ::-1])
+    np.testing.assert_array_equal(turned.support, made.support[:, ::-1])
+    assert turned.start == pytest.approx([0.75, 8 - made.start[1], -made.start[2]])
+    assert turned.goal == pytest.approx([7.25, 8 - made.goal[1]])
+    assert turned.features.slope == -made.features.slope
+    np.testing.assert_array_equal(turned.features.trenches, made.features.trenches)
+    x, y, diameter = turned.features.pillars.T  # each is where its heights are
+    grid = np.arange(161) * 0.05
+    away = np.hypot(grid[:, None, None] - x, grid[None, :, None] - y) - diameter / 2
+    if family == "pillar":
+        np.testing.assert_array_equal(turned.heights > 0, (away <= 1e-12).any(axis=-1))
+    twice = turned.mirrored()
+    assert twice.start == pytest.approx(made.start) and twice.heights is not turned.heights
+    np.testing.assert_allclose(twice.features.pillars, made.features.pillars)
+
+
 # Mixed
 
 
@@ -398,8 +418,13 @@ def test_seeds_must_be_one_word(seed):
 
 
 @pytest.fixture(scope="module")
-def grid() -> TerrainGrid:
-    return TerrainGrid.build((2, 7), ("stair", "rough", "mixed"), seed=3)
+def grid() -> TileField:
+    """The paper's grid: rows are levels, columns are families."""
+    field = TileField((2, 3))
+    for row, level in enumerate((2, 7)):
+        for col, family in enumerate(("stair", "rough", "mixed")):
+            field.place(row, col, make_tile(family, level / 10, tile_rng(3, family, level, 0)))
+    return field
 
 
 def test_grid_rows_are_levels_and_columns_families(grid):
@@ -430,46 +455,27 @@ def test_on_tile(grid):
     np.testing.assert_array_equal(grid.on_tile([1, 0], [2, 2], 12.0, 20.0), [True, False])
 
 
-def test_redraw_keeps_the_buffers_and_draws_new_tiles():
-    grid = TerrainGrid.build((3, 3), ("rough", "pillar"), seed=1, index=[[0], [1]])
-    heights, support, before = grid.heights, grid.support, grid.heights.copy()
-    assert (before[:161] != before[161:]).any()  # one level twice, told apart by the index
-    grid.redraw(2)
-    assert grid.heights is heights and grid.support is support
-    np.testing.assert_array_equal(heights[:161], heights[161:])
-    assert (heights[30:131, :161] != before[30:131, :161]).mean() > 0.9
-    made = make_tile("rough", 0.3, tile_rng(1, "rough", 3, 2))
-    np.testing.assert_array_equal(heights[:161, :161], made.heights)
-    grid.redraw([[0], [1]])
-    np.testing.assert_array_equal(heights, before)
+def test_a_tile_takes_anothers_place_in_the_same_buffers():
+    field = TileField((2, 1))
+    heights, support = field.heights, field.support
+    tiles = [make_tile("rough", 0.3, tile_rng(1, "rough", 3, index)) for index in (0, 1)]
+    for tile in tiles:
+        field.place(1, 0, tile)
+    assert field.heights is heights and field.support is support
+    np.testing.assert_array_equal(heights[161:], tiles[1].heights)
+    assert (heights[:161] == 0.0).all()
 
 
-def test_training_and_evaluation_grids_differ():
+def test_tiles_of_training_and_evaluation_differ():
     train, held_out = (
-        TerrainGrid.build((5,), ("rough",), seed=0, stream=stream)
+        make_tile("rough", 0.5, tile_rng(0, "rough", 5, 0, stream))
         for stream in (TRAIN_STREAM, EVAL_STREAM)
     )
     assert (train.heights[30:131] != held_out.heights[30:131]).mean() > 0.9
 
 
-def test_grid_stays_within_bullets_limit():
-    TerrainGrid((0,) * 16, ("rough",) * 5, seed=0)  # 80 tiles
-    with pytest.raises(ValueError, match=r"1 to 80 tiles .* got 9 x 9"):
-        TerrainGrid((0,) * 9, ("rough",) * 9, seed=0)
-    with pytest.raises(ValueError, match=r"got 0 x 1"):
-        TerrainGrid.build((), ("rough",), seed=0)
-
-
-def test_grid_checks_levels_and_families():
-    for level in (-1, 13, 2.5):
-        with pytest.raises(ValueError, match=r"whole numbers from 0 to 12"):
-            TerrainGrid.build((level,), ("rough",), seed=0)
-    with pytest.raises(ValueError, match=r"unknown terrain family 'ramp'"):
-        TerrainGrid.build((0,), ("ramp",), seed=0)
-
-
 def test_height_at_follows_bullets_triangles():
-    grid = TerrainGrid((0,), ("rough",), seed=0)
+    grid = TileField((1, 1))
     # One cell with corners a = [4, 6], b = [5, 6], c = [4, 7], e = [5, 7]; its diagonal is b-c.
     a, b, c, e = 0.1, 0.3, -0.2, 0.7
     grid.heights[4:6, 6:8] = [[a, c], [b, e]]
@@ -494,7 +500,7 @@ def test_height_at_follows_bullets_triangles():
 def test_height_at_hits_every_sample_and_clamps_outside(grid):
     ix, iy = np.meshgrid(np.arange(322), np.arange(483), indexing="ij")
     np.testing.assert_allclose(grid.height_at(ix * 0.05, iy * 0.05), grid.heights, atol=1e-6)
-    grid = TerrainGrid((0,), ("rough",), seed=0)
+    grid = TileField((1, 1))
     grid.heights[0, 0], grid.heights[-1, -1], grid.heights[80, -1] = 1, 2, 3
     assert grid.height_at(-5.0, -5.0) == pytest.approx(1)
     assert grid.height_at(99.0, 99.0) == pytest.approx(2)

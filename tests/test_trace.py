@@ -73,7 +73,7 @@ def watch(driver: Driver, cell: Cell, low: Any) -> tuple[Notes, list[Trace], lis
     notes = Notes(driver, 5)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "HORIZON", 1.04)  # 52 control steps: the last decision is cut off
-        episodes = run_cell(cell, low, driver, 5, notes)
+        episodes = run_cell(cell, low, driver, 5, [notes])
     return notes, notes.traces(), episodes
 
 
@@ -138,7 +138,7 @@ def test_decisions_are_those_of_the_policy_and_what_they_decode_to(watched):
 def test_commands_at_their_bounds_are_marked(low):
     class Extreme(BaselineDriver):
         def command(self, step: int) -> Array:
-            super().command(step)[:, [INDEX["vx"], INDEX["vy"]]] = 1.0, -0.6
+            super().command(step)[:, [INDEX["vx"], INDEX["vy"]]] = 1.2, -0.6
             return self._command
 
     _, (t,), _ = watch(Extreme(), Cell("gp", "nominal", "rough", 0, 0, 1), low[0])
@@ -415,7 +415,7 @@ def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
 def test_without_pyarrow_the_script_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pyarrow", None)  # as if it were not installed
     assert evaluate.main(["--trace", "all", "--out", str(tmp_path / "out")]) == 2
-    message = "traces need pyarrow: install the extra 'trace', "
+    message = "a trace needs pyarrow: install the extra 'trace', "
     message += "pip install -c constraints.txt -e '.[trace]'"
     assert capsys.readouterr().err == f"evaluate.py: {message}\n"
     assert not (tmp_path / "out").exists()

@@ -250,7 +250,7 @@ def test_the_policy_is_symmetric(tmp_path: Path) -> None:
     """Mirrored observation, mirrored action, same value: before and after a change of weights,
     and in the saved file."""
     config = LowTrainConfig().env
-    mirror, actor_dim = low_mirror(config), width(actor_layout(config.gyro))
+    mirror, actor_dim = low_mirror(config), width(actor_layout(config.robot, config.gyro))
     policy = AsymmetricActorCriticPolicy(
         *low_spaces(config), lambda _: 1e-3, actor_dim=actor_dim,
         mirror=mirror, net_arch={"pi": [16], "vf": [16]},
@@ -403,7 +403,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert [row["steps"] for row in rows(whole)] == [16, 32]
     # Of imitation, and of reinforcement learning after 24 of 40 steps: from 3e-4 to 5e-5.
     rates = [row["train/learning_rate"] for row in rows(whole)]
-    assert rates == pytest.approx([1e-3, 5e-5 + 0.4 * 2.5e-4])
+    assert rates == pytest.approx([1e-3, 5e-5 + 0.4 * 1.5e-4])
     last = broken / "checkpoints/step-000000000024"
     with monkeypatch.context() as patch:
         at_calls(patch, lambda call, run: setattr(run, "reason", "a test" if call == 2 else None))

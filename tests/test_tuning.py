@@ -159,8 +159,8 @@ def test_the_policy_sees_its_own_decisions(pair, loco):
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("decoder.vx.high=1.2", r"vx.high=1.2: the low policy was trained on \[-1.0, 1.0\]"),
-        ("decoder.vx.low=-3", r"decoder.vx.low=-3.0: the low policy was trained on \[-1.0, 1.0\]"),
+        ("decoder.vx.high=1.3", r"vx.high=1.3: the low policy was trained on \[-1.0, 1.2\]"),
+        ("decoder.vx.low=-3", r"decoder.vx.low=-3.0: the low policy was trained on \[-1.0, 1.2\]"),
         ("decoder.vx.high=0.9", r"a bound can only narrow the policy's \[-0.8, 0.8\]"),
         ("decoder.vx={\"low\": 0.5, \"high\": 0.2}", "the lower bound 0.5 is above the upper 0.2"),
         ("decoder.gaits=[]", r"must name some of trot, pronk, pace, bound, each once, not \[\]"),

@@ -12,8 +12,6 @@ error, and the others are kept. Writes ``ablation.json``, ``ablation.txt`` and `
 It is run where the scripts are, in the root of the repository.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

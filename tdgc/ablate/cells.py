@@ -4,12 +4,9 @@ A cell has a folder: the run of its training, ``evaluation`` with the results of
 ``cell.json`` once it is done. Until then a cell that is run again goes on where it was.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
-import os
 import shutil
 import signal
 import sys
@@ -24,6 +21,7 @@ import train_high
 from tdgc import policies
 from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
+from tdgc.files import atomic
 from tdgc.parallel.cores import Workers
 from tdgc.tasks.high_env import load_low
 
@@ -109,9 +107,8 @@ class Runner:
         found = {"evaluate_seconds": round(time.monotonic() - began, 1)}
         if cell.variant.settings is not None:
             found |= _training_facts(folder, low)
-        partial = folder / "cell.tmp"
-        partial.write_text(json.dumps(found, indent=2), encoding="utf-8")
-        os.replace(partial, folder / "cell.json")
+        with atomic(folder / "cell.json") as partial:
+            partial.write_text(json.dumps(found, indent=2), encoding="utf-8")
         return found
 
     def training_settings(self, variant: Variant) -> tuple[str, ...]:

@@ -3,8 +3,6 @@
 Intervals are those of the tiles. How much a seed changes shows in the rates of the seeds alone.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path

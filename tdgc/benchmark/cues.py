@@ -6,33 +6,29 @@ for the benchmark's constants (where starts and goals lie along a tile) and wher
 lands when it leaps.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.benchmark.memory import Clock, Delay, Obstacles, Profile, Reckoning
+from tdgc.benchmark.memory import Obstacles, Profile, Reckoning
 from tdgc.config import HighLevelConfig, LowLevelConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, ZONE
 from tdgc.tasks.high_env import GOAL_SCALE, SEMANTIC, high_layout
-from tdgc.tasks.leaps import SPEED, Landing, LeapPlan, leap_command
+from tdgc.tasks.leaps import BEYOND, SPEED, Landing, LeapPlan, Motion, leap_command, steer_leap
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.teacher import STYLES, Style, toward
 
 #: How to walk where no family is told: what rough ground, stairs and slopes have in common.
-UNKNOWN = Style(0.6, frequency=3.2, swing_height=0.2, stance_width=0.33)
+UNKNOWN = Style(0.6, frequency=3.2, swing_height=0.2, stance_width=0.33, uphill=0.45)
 
 # m below the ground around: a trench, half way down its walls. Planned from lip to lip 26 of 100
 # robots got over level 10, like this 54.
 _DEEP = -0.3
 _TALL = 0.35  # m above it: a pillar, as far as no stairs are about
 _GROUND = 0.3  # m, what is further from the standing height is not the ground around
-_BEYOND = 0.5  # m behind the last trench, where leaping ends; as for the teacher
 _WIDEST = 0.35  # m, a trench of level 10 from lip to lip, whose end is not in sight yet
-_TURN = 1.5  # 1/s, yaw rate per rad that a leap is off its heading; as for the teacher
 
 
 class Memory:
@@ -40,27 +36,27 @@ class Memory:
 
     Attributes:
         told: (M,) names of families, as the semantic cue has them.
-        where, clock, delay, obstacles: see ``tdgc.benchmark.memory``.
-        profiles: if the probes are on time, and if they are a decision late.
+        where, profile, obstacles: see ``tdgc.benchmark.memory``.
         places: (2, M, 32, 2) m, where the probes were a decision ago.
         gap, pillar: (M,) whether there are trenches, and pillars; told or seen.
+        slope: (M,) rad of the ground across the heading; positive where it rises to the left.
         x: (M,) m along the tile, a decision ago.
         plan: of landings; ``planned`` holds the lips (k, 2) m that each robot's plan is for.
         command: (M, 15) of the last decision.
     """
 
     def __init__(
-        self, low: LowLevelConfig, told: list[str], distance: Array, bearing: Array, signal: Array
+        self, low: LowLevelConfig, told: list[str], distance: Array, bearing: Array
     ) -> None:
         m = len(told)
         self.told = told
-        self.where, self.clock = Reckoning(distance, bearing), Clock(low.robot, signal)
-        self.delay, self.obstacles = Delay(low.robot, m), Obstacles(m)
-        self.profiles = Profile(m), Profile(m)
+        self.where = Reckoning(distance, bearing)
+        self.profile, self.obstacles = Profile(m), Obstacles(m)
         self.places: Array | None = None
         self.gap = np.array([name == "gap" for name in told])
         self.pillar = np.array([name == "pillar" for name in told])
         self.unknown = np.array([name == "unknown" for name in told])
+        self.slope = np.zeros(m)
         self.x = self.where.position[0, :, 0]
         self.plan = LeapPlan(m, low.commands)
         self.planned = [np.full((1, 2), np.nan)] * m
@@ -79,33 +75,31 @@ class CuesLaw:
     def __init__(
         self, low: LowLevelConfig, landing: Landing | None, config: HighLevelConfig
     ) -> None:
-        self._low, self._landing, self._steps = low, landing, config.decimation
-        self._ranges, self._control_dt = low.commands, low.physics.control_dt
-        self._dt = self._steps * self._control_dt
+        self._low, self._landing, self._ranges = low, landing, low.commands
+        self._dt = config.decimation * low.physics.control_dt
         self._points = PROBES[config.probes]
         self._ahead = self._points[:, 1] == 0.0
-        self._columns = columns(high_layout(config.cues))
+        self._columns = columns(high_layout(config))
         self._decoder = CommandDecoder(low.commands, config.action_limit)
 
     def predict(
         self, obs: NDArray[np.floating], state: Memory | None = None
     ) -> tuple[Array, Memory]:
-        """Actions (M, 13) from o^H (M, 86), and what is remembered for the next decision."""
+        """Actions (M, 13) from o^H (M, 91), and what is remembered for the next decision."""
         rows = np.asarray(obs, dtype=np.float64)
         cue = {name: rows[:, place] for name, place in self._columns.items()}
         distance = cue["goal"][:, 0] / GOAL_SCALE
         bearing = np.arctan2(cue["goal"][:, 2], cue["goal"][:, 1])
         if state is None:
             told = [SEMANTIC[k] for k in cue["family"].argmax(axis=1)]
-            state = Memory(self._low, told, distance, bearing, cue["clock"])
+            state = Memory(self._low, told, distance, bearing)
         else:
             velocity = state.command[:, [INDEX["vx"], INDEX["vy"]]]
             state.where.move(distance, bearing, velocity, self._dt)
-            state.clock.move(cue["clock"], state.command, self._control_dt, self._steps)
         self._look(state, cue)
         state.command = self._walk(state, distance, bearing)
         if self._landing is not None:
-            self._leap(state, bearing, self._landing)
+            self._leap(state, cue, bearing, self._landing)
         # A low policy may have been trained on less than the styles ask for.
         state.command = np.clip(state.command, self._decoder.low, self._decoder.high)
         return self._decoder.encode(state.command), state
@@ -117,8 +111,9 @@ class CuesLaw:
         level = np.where(np.abs(probes) < _GROUND, probes, np.nan)
         level[np.isnan(level).all(axis=1)] = 0.0
         ground = np.nanmedian(level, axis=1)
-        memory.delay.add(cue["gravity"], cue["joint_error"], ground)
         height = probes - ground[:, None]
+        aside = self._points[:, 1]
+        memory.slope = np.arctan(height @ aside / np.sum(aside**2))
         line = height[:, self._ahead]
         jump = line[:, 2:] - line[:, :-2]  # over 10 cm, where a stair has one step at most
         far = line[:, 2:]
@@ -129,19 +124,15 @@ class CuesLaw:
         places = memory.where.points(self._points)
         before = places if memory.places is None else memory.places
         memory.places = places
-        for profile, seen in zip(memory.profiles, (places, before), strict=True):
-            profile.add(seen[..., 0], (height < _DEEP) & memory.gap[:, None], self._ahead)
-        late = memory.delay.late()
+        seen = np.where(cue["probe_age"][:, :, None] > 0.5, before, places)
+        memory.profile.add(seen[..., 0], (height < _DEEP) & memory.gap[:, None], self._ahead)
         for i in np.flatnonzero(memory.pillar).tolist():
-            seen = before if late[i] else places
             memory.obstacles.add(i, seen[0, i, height[i] > _TALL])
 
     def _walk(self, memory: Memory, distance: Array, bearing: Array) -> Array:
         """Commands (M, 15) to the goal, around pillars, in the style of the family."""
         styles = [STYLES.get(name, UNKNOWN) for name in memory.told]
-        command = np.tile(default_command(), (len(styles), 1))
-        for name in ("frequency", "swing_height", "stance_width"):
-            command[:, INDEX[name]] = [getattr(style, name) for style in styles]
+        command = np.array([style.command() for style in styles])
         fast = np.array([style.speed for style in styles])
         fast[memory.pillar] = STYLES["pillar"].speed
         error, goal = bearing.copy(), np.array([GOAL_X, 0.0])
@@ -151,12 +142,15 @@ class CuesLaw:
             error[i] = wrap_angle(way - heading)
         speed, turn = toward(distance, error, fast, turns=self._ranges.yaw_rate)
         command[:, INDEX["vx"]], command[:, INDEX["yaw_rate"]] = speed, turn
+        uphill = np.array([style.uphill for style in styles]) * np.sin(memory.slope)
+        command[:, INDEX["vy"]] = np.clip(uphill, *self._ranges.vy)
         return command
 
-    def _leap(self, memory: Memory, bearing: Array, landing: Landing) -> None:
+    def _leap(
+        self, memory: Memory, cue: dict[str, Array], bearing: Array, landing: Landing
+    ) -> None:
         """Turn the commands of robots that have trenches before them into those of leaps."""
-        late = memory.delay.late().astype(int)
-        track = np.choose(late, [profile.track() for profile in memory.profiles])
+        track = memory.profile.track()
         tracks = np.maximum(track, 0).tolist()
         chosen = tracks, np.arange(len(tracks))
         heading, x = memory.where.heading[chosen], memory.where.position[chosen][:, 0]
@@ -165,10 +159,9 @@ class CuesLaw:
         speed, memory.x = (x - memory.x) / self._dt, x
         leaping = []
         for i in np.flatnonzero(memory.gap).tolist():
-            profile = memory.profiles[late[i]]
-            lips = profile.trenches(i, tracks[i], _WIDEST)
-            done = memory.unknown[i] or profile.seen(i, tracks[i]) > ZONE[1]
-            if done and x[i] > lips.max(initial=0.0) + _BEYOND:
+            lips = memory.profile.trenches(i, tracks[i], _WIDEST)
+            done = memory.unknown[i] or memory.profile.seen(i, tracks[i]) > ZONE[1]
+            if done and x[i] > lips.max(initial=0.0) + BEYOND:
                 continue
             if not np.array_equal(lips, memory.planned[i]):
                 memory.plan.look(i, lips, landing.spread)
@@ -176,13 +169,12 @@ class CuesLaw:
             leaping.append(i)
         if leaping:
             rows = np.array(leaping)
-            goal = heading[rows] + bearing[rows]
             leaps = memory.command[rows]
-            leaps[:, INDEX["vx"]] = SPEED * np.cos(goal)
-            leaps[:, INDEX["vy"]] = np.clip(SPEED * np.sin(goal), *self._ranges.vy)
-            turn = np.clip(-_TURN * heading[rows], *self._ranges.yaw_rate)
-            leaps[:, INDEX["yaw_rate"]] = turn
-            clock = memory.clock.now[rows]
-            steps = memory.plan.steps(rows, x[rows], speed[rows], clock, landing)
-            leap_command(leaps, *steps)
+            steer_leap(leaps, heading[rows] + bearing[rows], heading[rows], self._ranges)
+            # In trot and pronk, at a duty factor of 0.5, the clock is the right front foot's phase.
+            phase = np.arctan2(cue["clock"][rows, 1], cue["clock_cosine"][rows, 1])
+            clock = np.mod(phase / (2.0 * np.pi), 1.0)
+            commanded = np.full(len(rows), min(SPEED, self._ranges.vx[1]))
+            motion = Motion(x[rows], speed[rows], commanded, clock)
+            leap_command(leaps, *memory.plan.steps(rows, motion, landing))
             memory.command[rows] = leaps

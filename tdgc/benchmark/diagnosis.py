@@ -9,31 +9,23 @@ Tracking is lost where its errors are larger than in all but a few stretches of 
 reached their goals: ``LIMITS``.
 """
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io
-import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tdgc.benchmark.evaluation import Episode, EpisodeRecord, tile_of
 from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
+from tdgc.files import atomic
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import (
-    GOAL_BEGIN,
-    MAX_LEVEL,
-    START_END,
-    TILE_SIZE,
-    ZONE,
-    Tile,
-)
+from tdgc.sim.terrain import GOAL_BEGIN, MAX_LEVEL, START_END, TILE_SIZE, ZONE, Tile
 
 LAYERS = ("decisions", "execution", "terrain")
 
@@ -120,33 +112,27 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
         raise ValueError("an episode that reached its goal has not failed")
     tile, place, feature = None, "", ""
     if trace.seed != NO_TILE:
-        tile = tile_of(trace.seed, trace.family, trace.level, trace.episode)
+        tile = tile_of(trace.seed, trace.family, trace.level, trace.episode, trace.condition)
         x, y = float(trace["base_x"][-1]), float(trace["base_y"][-1])
         found = sorted(features(tile, x, y), key=lambda feature: feature[1])
         place, feature = place_of(x), f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
-    layer, cause, evidence = _judge(trace, tile, hips)
+    (layer, cause), evidence = _judge(trace, tile, hips)
     return Diagnosis(
-        trace.policy,
-        trace.condition,
-        trace.family,
-        trace.level,
-        trace.episode,
-        trace.seed,
-        trace.outcome,
-        round(float(trace["time"][-1]), 2),
-        place,
-        feature,
-        layer,
-        cause,
-        evidence,
+        **{field.name: getattr(trace, field.name) for field in dataclasses.fields(EpisodeRecord)},
+        time_s=round(float(trace["time"][-1]), 2),
+        place=place,
+        feature=feature,
+        layer=layer,
+        cause=cause,
+        evidence=evidence,
     )
 
 
 # ---------------------------------------------------------------------------- which layer
 
 
-def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[str, str, str]:
-    """Layer, cause and evidence."""
+def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str], str]:
+    """Layer and cause, and the evidence."""
     intervals, x, y = judged(trace), trace["base_x"], trace["base_y"]
     # Near a pillar a robot may be held up by it.
     held, at_trench = np.zeros(len(x), dtype=bool), False
@@ -162,33 +148,30 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[str, str, str]
     }
     lost = [name for name, error in errors.items() if error > limits[name]]
     towards = asked_towards(trace, intervals)
-    evidence = _evidence(trace, intervals, errors, limits, towards)
     # Of a collision on no tile it is said, not measured, that it was not with the ground.
     tripped = trace.outcome == "collided" and tile is not None and not held[-1]
     down = trace.outcome == "fell" or tripped
     if trace.family == "mixed" or trace.level > MAX_LEVEL:
-        return "terrain", "never trained on", evidence
-    if towards < -AWAY:
-        return "decisions", "led away from the goal", evidence
-    if at_trench and not has_looked(trace):
-        return "decisions", "walked blindly into a trench", evidence
-    if lost:
-        return "execution", f"lost track of {' and '.join(lost)}", evidence
-    if down and towards > 0.0:
-        return "execution", "lost its footing on the way to the goal", evidence
-    if down:
-        return "decisions", "lost its footing on the way elsewhere", evidence
-    if trace.outcome == "collided":
-        return (
-            "decisions",
-            f"steered into {'an obstacle' if tile is None else 'a pillar'}",
-            evidence,
-        )
-    if trace.outcome == "left_tile":
-        return "decisions", "steered off the tile", evidence
-    if held[-1]:
-        return "decisions", "held up by a pillar", evidence
-    return "decisions", "found no way to the goal", evidence
+        blamed = "terrain", "never trained on"
+    elif towards < -AWAY:
+        blamed = "decisions", "led away from the goal"
+    elif at_trench and not has_looked(trace):
+        blamed = "decisions", "walked blindly into a trench"
+    elif lost:
+        blamed = "execution", f"lost track of {' and '.join(lost)}"
+    elif down and towards > 0.0:
+        blamed = "execution", "lost its footing on the way to the goal"
+    elif down:
+        blamed = "decisions", "lost its footing on the way elsewhere"
+    elif trace.outcome == "collided":
+        blamed = "decisions", f"steered into {'an obstacle' if tile is None else 'a pillar'}"
+    elif trace.outcome == "left_tile":
+        blamed = "decisions", "steered off the tile"
+    elif held[-1]:
+        blamed = "decisions", "held up by a pillar"
+    else:
+        blamed = "decisions", "found no way to the goal"
+    return blamed, _evidence(trace, intervals, errors, limits, towards)
 
 
 def judged(trace: Trace) -> NDArray[np.bool_]:
@@ -323,12 +306,51 @@ def write(diagnoses: Sequence[Diagnosis], path: str | Path) -> None:
     writer = csv.DictWriter(text, [f.name for f in dataclasses.fields(Diagnosis)])
     writer.writeheader()
     writer.writerows(dataclasses.asdict(d) for d in diagnoses)
-    partial = Path(path).with_suffix(f".{os.getpid()}.tmp")
-    try:
+    with atomic(Path(path)) as partial:
         partial.write_text(text.getvalue(), encoding="utf-8", newline="")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+
+
+def count_failures(
+    diagnoses: Sequence[Mapping[str, Any]], episodes: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Of each policy and condition its failures: by family and level, and where most is to be won.
+
+    A layer's points are the failures that it is to blame for, in per cent of all episodes.
+
+    Args:
+        diagnoses: rows of diagnosis.csv.
+        episodes: rows of episodes.csv, failed or not.
+    """
+    result = []
+    for policy, condition in dict.fromkeys((e["policy"], e["condition"]) for e in episodes):
+        mine = [d for d in diagnoses if (d["policy"], d["condition"]) == (policy, condition)]
+        total = sum((e["policy"], e["condition"]) == (policy, condition) for e in episodes)
+        cells = []
+        for family, level in dict.fromkeys((d["family"], d["level"]) for d in mine):
+            cell = [d for d in mine if (d["family"], d["level"]) == (family, level)]
+            layers = Counter(d["layer"] for d in cell)
+            cause, times = Counter(d["cause"] for d in cell).most_common(1)[0]
+            cells.append(
+                {
+                    "family": family,
+                    "level": level,
+                    "layers": [layers[layer] for layer in LAYERS],
+                    "cause": cause,
+                    "times": times,
+                }
+            )
+        worst = Counter((d["family"], d["layer"]) for d in mine).most_common(1)
+        result.append(
+            {
+                "policy": policy,
+                "condition": condition,
+                "failures": len(mine),
+                "total": total,
+                "cells": cells,
+                "most": [(*where, 100 * count / total) for where, count in worst],
+            }
+        )
+    return result
 
 
 def describe(diagnoses: Sequence[Diagnosis], episodes: Sequence[Episode]) -> str:
@@ -339,23 +361,20 @@ def describe(diagnoses: Sequence[Diagnosis], episodes: Sequence[Episode]) -> str
         episodes: all episodes, failed or not.
     """
     lines: list[str] = []
-    runs = dict.fromkeys((e.policy, e.condition) for e in episodes)
-    for policy, condition in runs:
-        mine = [d for d in diagnoses if (d.policy, d.condition) == (policy, condition)]
-        total = sum((e.policy, e.condition) == (policy, condition) for e in episodes)
-        lines.append(f"failures of {policy}, {condition}: {len(mine)} of {total} episodes")
-        if not mine:
+    for run in count_failures([vars(d) for d in diagnoses], [vars(e) for e in episodes]):
+        failed = f"{run['failures']} of {run['total']} episodes"
+        lines.append(f"failures of {run['policy']}, {run['condition']}: {failed}")
+        if not run["failures"]:
             continue
         head = "".join(f"{layer:>11}" for layer in LAYERS)
-        wide = max(8, *(len(d.family) + 1 for d in mine))
+        wide = max(8, *(len(cell["family"]) + 1 for cell in run["cells"]))
         lines.append(f"{'family'.ljust(wide)}level{head}  commonest cause")
-        for family, level in dict.fromkeys((d.family, d.level) for d in mine):
-            cell = [d for d in mine if (d.family, d.level) == (family, level)]
-            counts = Counter(d.layer for d in cell)
-            numbers = "".join(f"{counts[layer]:>11}" for layer in LAYERS)
-            cause, times = Counter(d.cause for d in cell).most_common(1)[0]
-            lines.append(f"{family.ljust(wide)}{level:>5}{numbers}  {cause} ({times})")
-        (family, layer), count = Counter((d.family, d.layer) for d in mine).most_common(1)[0]
-        points = f"{100 * count / total:.1f} points of success"
-        lines.append(f"most is to be won in {family}, by {layer}: {points}")
+        for cell in run["cells"]:
+            numbers = "".join(f"{count:>11}" for count in cell["layers"])
+            cause = f"{cell['cause']} ({cell['times']})"
+            lines.append(f"{cell['family'].ljust(wide)}{cell['level']:>5}{numbers}  {cause}")
+        for family, layer, points in run["most"]:
+            lines.append(
+                f"most is to be won in {family}, by {layer}: {points:.1f} points of success"
+            )
     return "\n".join(lines)

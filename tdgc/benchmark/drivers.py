@@ -1,7 +1,6 @@
 """Who decides on commands: the hierarchy's high policy, or the paper's scripted baseline."""
 
-from __future__ import annotations
-
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,16 +20,16 @@ from tdgc.config import (
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.observation import width
+from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
-from tdgc.tasks.high_env import SEMANTIC, high_layout, observe_high, paired
+from tdgc.tasks.high_env import SEMANTIC, Seen, high_layout, paired
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.teacher import Teacher, toward
 
 
-class Driver(Protocol):
+class Driver(ABC):
     """Drives robots to their goals, step by step.
 
     Attributes:
@@ -43,10 +42,11 @@ class Driver(Protocol):
 
     config: HighLevelConfig
     bounds: CommandRanges
-    action: NDArray[np.floating] | None
-    told: str | None
-    probes: Array | None
+    action: NDArray[np.floating] | None = None
+    told: str | None = None
+    probes: Array | None = None
 
+    @abstractmethod
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         """New episodes for all robots of ``loco``.
 
@@ -57,6 +57,7 @@ class Driver(Protocol):
             noise: of the height probes; None for exact ones.
         """
 
+    @abstractmethod
     def command(self, step: int) -> Array:
         """Commands (M, 15) for the coming control step number ``step``."""
 
@@ -83,16 +84,13 @@ class GoToGoal:
         return toward(distance, error, self.top_speed, self.distance_gain, self.heading_gain)
 
 
-class BaselineDriver:
+class BaselineDriver(Driver):
     """Drives robots by ``GoToGoal``, anew at every control step; it knows no families."""
 
     def __init__(self, law: GoToGoal | None = None) -> None:
         self.law = law or GoToGoal()
         self.config = HighLevelConfig(cues="none")
         self.bounds = CommandRanges()
-        self.action: NDArray[np.floating] | None = None
-        self.told: str | None = None
-        self.probes: Array | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
@@ -106,7 +104,7 @@ class BaselineDriver:
         return self._command
 
 
-class TeacherDriver:
+class TeacherDriver(Driver):
     """Drives robots by the scripted teacher, decided as often as the hierarchy decides.
 
     It is told what the hierarchy has to find out, so it is no rival: it shows what the low policy
@@ -120,9 +118,6 @@ class TeacherDriver:
         self.config = HighLevelConfig(cues="none")
         self._landing = measure_landing(low, config)
         self.bounds = config.commands
-        self.action: NDArray[np.floating] | None = None
-        self.told: str | None = None
-        self.probes: Array | None = None
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
@@ -133,6 +128,8 @@ class TeacherDriver:
 
     def command(self, step: int) -> Array:
         if step % self.config.decimation == 0:
+            seconds = self.config.decimation * self._loco.physics.control_dt
+            self._teacher.watch(self._loco, seconds)
             self._command = self._teacher.commands(self._loco, self._goal)
         return self._command
 
@@ -145,7 +142,7 @@ class Decides(Protocol):
         next state."""
 
 
-class HierarchyDriver:
+class HierarchyDriver(Driver):
     """Drives robots by the high policy (paper Sec. IV-B), ``tdgc``; recurrent or feed-forward.
 
     A decision is deterministic and its commands are held for ``decimation`` control steps.
@@ -158,9 +155,6 @@ class HierarchyDriver:
         self._high, self.config = high, config
         assert config.commands is not None  # filled in by ``load_high``
         self.bounds = config.commands
-        self.action: NDArray[np.floating] | None = None
-        self.told: str | None = None
-        self.probes: Array | None = None
         self._decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
@@ -197,9 +191,10 @@ class HierarchyDriver:
         if self.config.cues in ("both", "geometric"):
             self.probes = probes
         share = np.full(len(rows), decision / self._horizon)
-        return observe_high(
-            self._loco, self._goal, share, self._last, self._families, self.config.cues, probes
+        seen = Seen(
+            self._loco, self._goal, share, self._last, self._families, probes, self._sensor.late
         )
+        return observe(high_layout(self.config), seen)
 
 
 def load_high(
@@ -228,7 +223,7 @@ def load_high(
                 f"{path}: trained for a low policy with robot.{field.name} {wanted}, not {given}"
             )
     for what, wanted, given in (
-        ("a high policy that observes {} values", width(high_layout(config.cues)), high.obs_dim),
+        ("a high policy that observes {} values", width(high_layout(config)), high.obs_dim),
         ("a low policy that observes {} values", observation, low.actor_dim),
         (
             "a low policy with a control step of {} s",

@@ -5,21 +5,17 @@ its policy, condition and tiles alone, not on how many processes share the batch
 the table.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
-import multiprocessing as mp
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, recorded
-from tdgc.parallel.worker import keep_memory, one_blas_thread
 from tdgc.policies import Policy
 from tdgc.sim.commands import gait_index
 from tdgc.sim.gaits import GAITS
@@ -49,10 +45,12 @@ class Condition:
     """One evaluation condition (benchmark); everything is nominal unless it says otherwise.
 
     Attributes:
+        what: it changes, for people.
         levels, families: where the condition is run; None for those asked for.
         episodes_share: of the episodes asked for, a cell (100 nominal, 20 for the others).
     """
 
+    what: str
     levels: tuple[int, ...] | None = None
     families: tuple[str, ...] | None = None
     friction: float | None = None
@@ -63,24 +61,32 @@ class Condition:
     physics_hz: int | None = None
     noise: RandomisationConfig | None = None  # of the sensors; the gait clock starts at random too
     told: bool = True  # the semantic cue names the family; "unknown" otherwise
+    mirrored: bool = False  # left and right of every tile exchanged
     episodes_share: float = 0.2
 
 
+PUSH_INTERVAL = 3.0  # s (benchmark's `pushes`)
+_NOISE = RandomisationConfig(probe_delay=1.0)
+
 #: The conditions of the benchmark by name.
 CONDITIONS: dict[str, Condition] = {
-    "nominal": Condition(episodes_share=1.0),
-    "levels-11-12": Condition(levels=(11, 12)),
-    "mixed": Condition(families=("mixed",)),
-    "friction-0.4": Condition(friction=0.4),
-    "payload-3kg": Condition(payload=3.0),
-    "pushes": Condition(push_speed=0.75),
-    "motor-0.85": Condition(motor=0.85),
-    "latency-30ms": Condition(latency=0.03),
-    "physics-1000hz": Condition(physics_hz=1000),
-    "noise": Condition(noise=RandomisationConfig(probe_delay=1.0)),
-    "no-family": Condition(told=False),
+    "nominal": Condition("nothing", episodes_share=1.0),
+    "levels-11-12": Condition("levels 11, 12", levels=(11, 12)),
+    "mixed": Condition("terrain mixed, which nothing was trained on", families=("mixed",)),
+    "friction-0.4": Condition("friction 0.4", friction=0.4),
+    "payload-3kg": Condition("3 kg on the trunk", payload=3.0),
+    "pushes": Condition(f"pushes of 0.75 m/s every {PUSH_INTERVAL:g} s", push_speed=0.75),
+    "motor-0.85": Condition("0.85 times the torque limits and gains of the joints", motor=0.85),
+    "latency-30ms": Condition("commands reach the joints 30 ms late", latency=0.03),
+    "physics-1000hz": Condition("physics at 1000 Hz", physics_hz=1000),
+    "noise": Condition(
+        "noise of the sensors as in training; the gait clock starts at random; height probes off "
+        f"by up to {100 * _NOISE.noise_probes:g} cm and a decision late",
+        noise=_NOISE,
+    ),
+    "no-family": Condition('the terrain family is "unknown" to the policy', told=False),
+    "mirrored": Condition("left and right of every tile exchanged", mirrored=True),
 }
-PUSH_INTERVAL = 3.0  # s (benchmark's `pushes`)
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,18 @@ class Cell:
     level: int
     first: int
     count: int
+
+    def record(self, k: int, seed: int, outcome: int) -> dict[str, Any]:
+        """The fields of ``EpisodeRecord`` of robot k, whose outcome indexes ``OUTCOMES``."""
+        return {
+            "policy": self.policy,
+            "condition": self.condition,
+            "family": self.family,
+            "level": self.level,
+            "episode": self.first + k,
+            "seed": seed,
+            "outcome": OUTCOMES[outcome],
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +182,11 @@ def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
     return physics
 
 
-def tile_of(seed: int, family: str, level: int, episode: int) -> Tile:
+def tile_of(seed: int, family: str, level: int, episode: int, condition: str = "nominal") -> Tile:
     """The tile of one episode, with its start and goal: the same for every policy."""
     rng = tile_rng(seed, family, level, episode, EVAL_STREAM)
-    return make_tile(family, level / MAX_LEVEL, rng)
+    tile = make_tile(family, level / MAX_LEVEL, rng)
+    return tile.mirrored() if CONDITIONS[condition].mirrored else tile
 
 
 # What else an episode draws, each from a generator of its own (the values only have to differ):
@@ -209,7 +228,6 @@ class Batch:
         cell: which episodes.
         config: of the low policy.
         seed: of the evaluation's tiles.
-        visual: keep what pictures of the ground need.
         make_world: of the field; a Bullet world by default.
 
     Attributes:
@@ -226,14 +244,13 @@ class Batch:
         cell: Cell,
         config: LowLevelConfig,
         seed: int,
-        visual: bool = False,
         make_world: Callable[[TileField], World] | None = None,
     ) -> None:
         self.cell, self.seed = cell, seed
         condition, rows = CONDITIONS[cell.condition], np.arange(cell.count)
         self.field = TileField((cell.count, 1))
         for k in rows:
-            tile = tile_of(seed, cell.family, cell.level, cell.first + int(k))
+            tile = tile_of(seed, cell.family, cell.level, cell.first + int(k), cell.condition)
             self.field.place(int(k), 0, tile)
         self.field.heights.setflags(write=False)  # for a faster world
         self.told = cell.family if condition.told else "unknown"
@@ -245,7 +262,7 @@ class Batch:
             clock = episode_draws(cell, seed, _CLOCK).uniform(0.0, 1.0, (cell.count,))
         physics = physics_of(config, condition)
         world = make_world(self.field) if make_world is not None else None
-        loco = Locomotion(cell.count, config.robot, physics, self.field, config.gyro, visual, world)
+        loco = Locomotion(cell.count, config.robot, physics, self.field, config.gyro, world=world)
         self.loco, self.origin = loco, self.field.origin(rows, 0)
         loco.friction[:] = physics.friction if condition.friction is None else condition.friction
         loco.payload[:], loco.delay[:] = condition.payload, condition.latency
@@ -315,13 +332,7 @@ class EpisodeLog:
         kept = -(-self._steps // self._pose_every)  # poses taken while it was up
         return [
             Episode(
-                policy=cell.policy,
-                condition=cell.condition,
-                family=cell.family,
-                level=cell.level,
-                episode=cell.first + k,
-                seed=self._batch.seed,
-                outcome=OUTCOMES[self.outcome[k]],
+                **cell.record(k, self._batch.seed, self.outcome[k]),
                 time_s=self._steps[k] * self._dt,
                 path_m=self._path[k],
                 energy_j=self._energy[k],
@@ -339,12 +350,7 @@ class EpisodeLog:
 
 
 def run_cell(
-    cell: Cell,
-    low: Policy,
-    driver: Driver,
-    seed: int,
-    watcher: Watcher | None = None,
-    visual: bool = False,
+    cell: Cell, low: Policy, driver: Driver, seed: int, watchers: Sequence[Watcher] = ()
 ) -> list[Episode]:
     """Run a batch of episodes to their ends.
 
@@ -353,26 +359,29 @@ def run_cell(
         low: the frozen low policy.
         driver: what commands it.
         seed: of the evaluation's tiles.
-        watcher: who looks on.
-        visual: keep what pictures of the ground need.
+        watchers: who look on.
 
     Returns:
         An episode each, in order.
     """
-    batch = Batch(cell, low_config(low), seed, visual)
+    batch = Batch(cell, low_config(low), seed)
     try:
         driver.begin(batch.loco, batch.goal, batch.told, batch.probes)
-        if watcher is not None:
+        for watcher in watchers:
             watcher.begin(cell, batch.loco, batch.field, batch.goal)
         log = EpisodeLog(batch)
-        closed_loop(driver, Executor(batch.loco, low, batch.sensors), batch, log, watcher)
+        closed_loop(driver, Executor(batch.loco, low, batch.sensors), batch, log, watchers)
     finally:
         batch.loco.world.close()
     return log.episodes()
 
 
 def closed_loop(
-    driver: Driver, executor: Carries, batch: Batch, log: EpisodeLog, watcher: Watcher | None
+    driver: Driver,
+    executor: Carries,
+    batch: Batch,
+    log: EpisodeLog,
+    watchers: Sequence[Watcher] = (),
 ) -> None:
     """The paper's closed loop (Sec. III), until every episode of a batch has ended."""
     for step in itertools.count():
@@ -385,7 +394,7 @@ def closed_loop(
         # At each control step: commands -> low policy -> joint targets -> physics.
         executor.step(commands, live)
         log.add(step)
-        if watcher is not None:
+        for watcher in watchers:
             watcher.step(step, live, log.outcome)
         batch.loco.world.retire(np.setdiff1d(live, log.live))
 
@@ -412,23 +421,3 @@ def plan(
                         size = min(BATCH, count - first)
                         cells.append(Cell(policy, name, family, level, first, size))
     return cells
-
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
-
-
-def spread(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    """``work`` on each job, in order, on ``workers`` processes at most."""
-    processes = min(workers, len(jobs))
-    spawn = mp.get_context("spawn")
-    with one_blas_thread(), spawn.Pool(processes, initializer=keep_memory) as pool:
-        yield from pool.imap(work, jobs)
-
-
-class Spread(Protocol):
-    """``spread``, or what does the same elsewhere."""
-
-    def __call__(
-        self, work: Callable[[Job], Result], jobs: Sequence[Job], workers: int
-    ) -> Iterator[Result]: ...

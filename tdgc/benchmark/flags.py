@@ -1,8 +1,57 @@
-"""Flags that name the cells of an evaluation."""
+"""Flags of an evaluation, in whatever simulator: which episodes, how many at once, where to."""
 
-from __future__ import annotations
+import argparse
+from pathlib import Path
 
-from tdgc.sim.terrain import OOD_LEVELS
+from tdgc.parallel.cores import usable_cores, workers_flag
+from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
+
+
+def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
+    """Flags that ``read`` reads; ``out`` is where results go by default."""
+    parser.add_argument("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
+    parser.add_argument(
+        "--families",
+        default="all",
+        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING}",
+    )
+    parser.add_argument("--episodes", type=int, default=100, help="a cell (100)")
+    parser.add_argument(
+        "--video",
+        type=int,
+        nargs="?",
+        const=1,
+        default=0,
+        metavar="N",
+        help="films, sheets and strips of the first N episodes of each cell (1)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
+    parser.add_argument(
+        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
+    )
+    parser.add_argument("--out", type=Path, default=Path(out), help="results folder")
+
+
+def read(args: argparse.Namespace) -> None:
+    """Turn levels, families and workers into what they name, in place.
+
+    Raises:
+        ValueError: flags that cannot be used, or a file of heights that cannot.
+        OSError: a file of heights that cannot be read.
+    """
+    args.levels = choose_levels(args.levels)
+    maps = tuple(filter(is_map, args.families.split(",")))
+    args.families = choose(args.families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
+    for name in maps:
+        height_map(name)
+    args.workers = usable_cores() if args.workers == "auto" else args.workers
+    for flag, value in (("--episodes", args.episodes), ("--workers", args.workers)):
+        if value < 1:
+            raise ValueError(f"{flag} must be at least 1, not {value}")
+    if not 0 <= args.seed < 2**32:
+        raise ValueError(f"--seed must lie in [0, 2**32), not {args.seed}")
+    if not 0 <= args.video <= args.episodes:
+        raise ValueError(f"--video must lie in [0, --episodes], not {args.video}")
 
 
 def choose(

@@ -3,16 +3,12 @@
 The high policy has a recurrent state for that.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.config import RobotConfig
-from tdgc.sim.commands import INDEX, gait_index
-from tdgc.sim.geometry import read_geometry
-from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, wrap_angle
+from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, START_X, TILE_SIZE
+from tdgc.tasks.planning import LOOK, between, cost_to_go, price_near
 from tdgc.tasks.rules import GOAL_RADIUS
 
 
@@ -58,38 +54,6 @@ class Reckoning:
         c, s = np.cos(self.heading)[..., None], np.sin(self.heading)[..., None]
         x, y = points.T
         return self.position[..., None, :] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
-
-
-class Delay:
-    """Whether the probes of M robots are a decision late.
-
-    A trunk that bobs shows in the heights ahead as well as in the joints of the legs that stand.
-
-    Args:
-        robot: says where its feet are.
-    """
-
-    _MOST = 0.04  # m, of a difference: more is uneven ground, or all feet in the air
-
-    def __init__(self, robot: RobotConfig, num_robots: int) -> None:
-        self._base, self._geometry = robot.base_height, read_geometry(robot)
-        self._pose = nominal_pose(robot)
-        self._before: Array | None = None  # it stood like that a decision ago, too
-        self._off = np.zeros((2, num_robots))
-
-    def add(self, gravity: Array, joint_error: Array, ground: Array) -> None:
-        """Compare the ``ground`` (M,) m that the probes have, against a standing robot's, to what
-        gravity (M, 3) in the trunk's frame and joints (M, 12) rad off the nominal pose say."""
-        feet, _ = foot_kinematics(self._geometry, self._pose + joint_error, 0.0 * joint_error)
-        stand = np.einsum("mfi,mi->mf", feet, gravity).max(axis=1) + self._geometry.foot_radius
-        now = self._base - stand
-        expected = np.stack([now, now if self._before is None else self._before])
-        self._off += np.minimum(np.abs(ground - expected), self._MOST) ** 2
-        self._before = now
-
-    def late(self) -> NDArray[np.bool_]:
-        """Whether what the joints said a decision ago explains the probes better, (M,)."""
-        return self._off[1] < self._off[0]
 
 
 class Profile:
@@ -144,50 +108,6 @@ class Profile:
         return float(np.flatnonzero(self._line[track, :, robot].sum(axis=0))[-1] * self._BIN)
 
 
-class Clock:
-    """The gait clocks of M robots, from the clock cue, which is the same twice in a cycle.
-
-    Args:
-        robot: says how a gait begins.
-        signal: (M, 4) the cue at the start, as ``PhaseClock.signal`` gives it.
-    """
-
-    def __init__(self, robot: RobotConfig, signal: Array) -> None:
-        self._robot = robot
-        self._cycles = np.zeros(len(signal))
-        self._gait = np.zeros(len(signal), dtype=np.int64)
-        self._doubtful = True  # whether the cue was seen only once
-        self.now = self._either(signal)[0]
-
-    def move(self, signal: Array, command: Array, dt: float, steps: int) -> None:
-        """Go on to the cue after ``steps`` control steps of ``dt`` s of the commands (M, 15)."""
-        gait, asked = gait_index(command), command[:, INDEX["frequency"]]
-        self._cycles[gait != self._gait] = 0.0
-        self._gait = gait
-        run = np.zeros(len(signal))
-        for _ in range(steps):
-            begun = np.minimum(self._cycles / max(self._robot.start_cycles, 1e-6), 1.0)
-            hurry = (1.0 - begun) * np.maximum(self._robot.start_frequency - asked, 0.0)
-            self._cycles += dt * (asked + hurry)
-            run += dt * (asked + hurry)
-        before = [self.now, 0.5 - self.now] if self._doubtful else [self.now]
-        self._doubtful = False
-        now = self._either(signal)
-        off = np.array([[_apart(a + run, b) for b in now] for a in before])
-        self.now = np.choose(off.min(axis=0).argmin(axis=0), now)
-
-    @staticmethod
-    def _either(signal: Array) -> tuple[Array, Array]:
-        """The two clocks that give the cue: in trot and pronk the right front foot's phase."""
-        first = np.arcsin(np.clip(signal[:, 1], -1.0, 1.0)) / (2.0 * np.pi)
-        return np.mod(first, 1.0), np.mod(0.5 - first, 1.0)
-
-
-def _apart(a: Array, b: Array) -> Array:
-    """How far apart two clocks are, in cycles."""
-    return np.abs(np.mod(a - b + 0.5, 1.0) - 0.5)
-
-
 class Obstacles:
     """Pillars that M robots have seen, and the way around them.
 
@@ -197,9 +117,7 @@ class Obstacles:
 
     _CELL = 0.05  # m, of what was seen
     _STEP, _HALF = 0.1, 12  # m and cells: the window is 2.5 m wide
-    _RADIUS, _WIDE = 0.28, 0.5  # m from a pillar: blocked within, free beyond; as for the teacher
-    _BLOCKED, _CLOSE = 30.0, 3.0  # cost of a metre inside the radius and at it; 1 in the open
-    _LOOK = 0.35  # m ahead, where the lowest cost is looked for; as for the teacher
+    _WIDE = 0.5  # m from a pillar, where it ceases to cost
     _AHEAD = 0.02  # m per rad, so that near ties go to the straight way
     _RAYS = np.linspace(-np.pi, np.pi, 48, endpoint=False)
 
@@ -217,45 +135,19 @@ class Obstacles:
         straight way, where nothing is in it."""
         seen = self._CELL * np.array(sorted(self._seen[robot]), dtype=float).reshape(-1, 2)
         seen = seen[(np.abs(seen - at) < self._STEP * self._HALF + self._WIDE).all(axis=1)]
-        if not seen.size or np.linalg.norm(goal - at) < self._LOOK:
+        if not seen.size or np.linalg.norm(goal - at) < LOOK:
             return ahead
         cells = at + self._window
         away = np.linalg.norm(cells[..., None, :] - seen, axis=-1).min(axis=-1)
-        near = np.clip((self._WIDE - away) / (self._WIDE - self._RADIUS), 0.0, 1.0)
-        price = np.where(away < self._RADIUS, self._BLOCKED, 1.0 + (self._CLOSE - 1.0) * near)
+        price = price_near(away, self._WIDE)
         straight = np.linalg.norm(cells - goal, axis=-1)
         cost = np.full(price.shape, np.inf)
         for edge in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
             cost[edge] = straight[edge] + self._STEP * (price[edge] - 1.0)
         home = straight < self._STEP
         cost[home] = straight[home]
-        cost = _settle(cost, self._STEP * price)
+        cost = cost_to_go(cost, self._STEP * price)
         rays = np.stack([np.cos(self._RAYS), np.sin(self._RAYS)], axis=-1)
-        value = _between(cost, self._HALF + self._LOOK / self._STEP * rays)
+        value = between(cost, self._HALF + LOOK / self._STEP * rays)
         value += self._AHEAD * np.abs(wrap_angle(self._RAYS - ahead))
         return float(self._RAYS[value.argmin()])
-
-
-def _settle(cost: Array, price: Array) -> Array:
-    """Least costs of getting out, (n, n): ``cost`` where one is out, inf elsewhere; ``price`` of
-    each cell."""
-    n = len(cost)
-    shifts = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
-    while True:
-        wide = np.pad(cost, 1, constant_values=np.inf)
-        around = [
-            wide[1 + a : 1 + a + n, 1 + b : 1 + b + n] + np.hypot(a, b) * price for a, b in shifts
-        ]
-        settled = np.minimum(cost, np.min(around, axis=0))
-        if np.array_equal(settled, cost):
-            return cost
-        cost = settled
-
-
-def _between(grid: Array, at: Array) -> Array:
-    """Values of a grid (n, n) between its cells, at (m, 2) in cells."""
-    i, j = np.floor(at).astype(int).T
-    a, b = at.T - (i, j)
-    return (1 - a) * ((1 - b) * grid[i, j] + b * grid[i, j + 1]) + a * (
-        (1 - b) * grid[i + 1, j] + b * grid[i + 1, j + 1]
-    )

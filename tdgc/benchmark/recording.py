@@ -1,10 +1,7 @@
 """Recordings: all that is needed to show an episode again, at every control step."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import Cell, EpisodeRecord, Watcher
+from tdgc.benchmark.evaluation import Cell, EpisodeRecord
 from tdgc.config import RobotConfig
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
 from tdgc.tasks.rewards import CONTACT_FORCE
-from tdgc.tasks.rules import OUTCOMES
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,38 +100,19 @@ class Recorder:
         result = []
         for k in self._rows:
             steps = self._kept[: self._steps[k]]
-            arrays = {key: np.array([step[key][k] for step in steps]) for key in steps[0]}
+            arrays: dict[str, Any] = {
+                key: np.array([step[key][k] for step in steps]) for key in steps[0]
+            }
             result.append(
                 Recording(
-                    cell.policy,
-                    cell.condition,
-                    cell.family,
-                    cell.level,
-                    cell.first + int(k),
-                    self._seed,
-                    OUTCOMES[self._outcome[k]],
-                    loco.robot,
-                    loco.physics.control_dt,
-                    bounds,
+                    **cell.record(int(k), self._seed, self._outcome[k]),
+                    robot=loco.robot,
+                    dt=loco.physics.control_dt,
+                    bounds=bounds,
                     **arrays,
                 )
             )
         return result
-
-
-class Together:
-    """Several watchers as one."""
-
-    def __init__(self, watchers: Sequence[Watcher]) -> None:
-        self._watchers = watchers
-
-    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
-        for watcher in self._watchers:
-            watcher.begin(cell, loco, field, goal)
-
-    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
-        for watcher in self._watchers:
-            watcher.step(step, live, outcome)
 
 
 def spans(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -1,7 +1,5 @@
 """Results: episodes -> rates with their intervals, and the files of a results folder."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections import Counter
@@ -14,9 +12,9 @@ import numpy as np
 from tdgc.benchmark.evaluation import Episode
 from tdgc.sim.terrain import EDITION
 
-#: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``, and of which edition of the
-#: benchmark the tiles are and those that the policies were trained on.
-PAIRED, EDITIONS = "paired", "editions"
+#: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and of
+#: which edition of the benchmark the tiles are and those that the policies were trained on.
+PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
 # The rule of dominance (TDGC-Bench): ``tdgc`` is nowhere below ``gp``. What it has over ``cues`` is
 # what learning adds to the cues.
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
@@ -107,6 +105,29 @@ def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, A
     return tree
 
 
+def sides(episodes: Iterable[Episode]) -> dict[str, Any]:
+    """policy -> family -> ``difference`` of tiles' mirror images and the tiles themselves, and
+    "mean" over the families: what a policy has learned of one side only."""
+    reached: dict[tuple[str, str, int, int], dict[str, bool]] = {}
+    for e in episodes:
+        if e.condition in ("mirrored", "nominal"):
+            images = reached.setdefault((e.policy, e.family, e.level, e.episode), {})
+            images[e.condition] = e.outcome == "reached"
+    tree: dict[str, Any] = {}
+    for (policy, family, *_), images in reached.items():
+        if len(images) == 2:
+            pair = images["mirrored"], images["nominal"]
+            for name in (family, "mean"):
+                tree.setdefault(policy, {}).setdefault(name, []).append(pair)
+    return {
+        policy: {
+            family: difference(families[family])
+            for family in sorted(families, key=lambda name: name == "mean")
+        }
+        for policy, families in tree.items()
+    }
+
+
 def rates(reached: Iterable[bool]) -> dict[str, float]:
     """Of episodes, each with whether it reached the goal: how many (n), reached, rate, and its
     interval ci_low, ci_high."""
@@ -153,14 +174,9 @@ def describe(summary: dict[str, Any]) -> str:
             lines += ["", f"{policy}, {condition}", *_rates(families)]
     for pair, conditions in summary.get(PAIRED, {}).items():
         for condition, families in conditions.items():
-            lines += ["", f"{pair} on the same tiles, {condition}"]
-            wide = max(8, *(len(name) + 1 for name in families))
-            for family, found in families.items():
-                points, low, high = (
-                    100 * found[key] for key in ("difference", "ci_low", "ci_high")
-                )
-                text = f"{family.ljust(wide)}{points:+6.1f}  [{low:+.1f}, {high:+.1f}]"
-                lines.append(f"{text}  {verdict(pair, found)}".rstrip())
+            lines += ["", f"{pair} on the same tiles, {condition}", *_differences(families, pair)]
+    for policy, families in summary.get(SIDES, {}).items():
+        lines += ["", f"{policy} on mirrored tiles - on the tiles", *_differences(families)]
     for name, edition in summary.get(EDITIONS, {}).items():
         if edition != EDITION:
             lines += [
@@ -173,12 +189,22 @@ def describe(summary: dict[str, Any]) -> str:
 
 def policies_of(summary: dict[str, Any]) -> dict[str, Any]:
     """The rates by policy of a ``summary``, without what stands beside them."""
-    return {key: value for key, value in summary.items() if key not in (PAIRED, EDITIONS)}
+    return {key: value for key, value in summary.items() if key not in (PAIRED, SIDES, EDITIONS)}
 
 
 def verdict(pair: str, found: dict[str, float]) -> str:
     """What a ``difference`` says of the rule of dominance: "below gp", or nothing to say."""
     return f"below {pair.rpartition(' ')[-1]}" if found["ci_high"] < 0.0 else ""
+
+
+def _differences(families: dict[str, Any], pair: str = "") -> list[str]:
+    wide = max(8, *(len(name) + 1 for name in families))
+    lines = []
+    for family, found in families.items():
+        points, low, high = (100 * found[key] for key in ("difference", "ci_low", "ci_high"))
+        text = f"{family.ljust(wide)}{points:+6.1f}  [{low:+.1f}, {high:+.1f}]"
+        lines.append(f"{text}  {verdict(pair, found) if pair else ''}".rstrip())
+    return lines
 
 
 def _rates(families: dict[str, Any]) -> list[str]:
@@ -219,6 +245,8 @@ def write_results(
     pairs = [pair for pair in _PAIRS if set(pair) <= summary.keys()]
     if pairs:
         summary[PAIRED] = {" - ".join(pair): compare(episodes, *pair) for pair in pairs}
+    if found := sides(episodes):
+        summary[SIDES] = found
     if editions:
         summary[EDITIONS] = {"tiles": EDITION, **editions}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")

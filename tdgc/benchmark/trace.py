@@ -8,11 +8,7 @@ Files are Parquet with scalar columns only, readable by any tool for tables. Wha
 its unit and the episode stand in the file too. They need pyarrow, the extra ``trace``.
 """
 
-from __future__ import annotations
-
 import dataclasses
-import importlib.util
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +20,8 @@ from numpy.typing import NDArray
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Cell, EpisodeRecord, joint_power
 from tdgc.config import CommandRanges
-from tdgc.errors import InputError, install_hint
+from tdgc.errors import InputError, require
+from tdgc.files import atomic
 from tdgc.sim.commands import (
     CONTINUOUS,
     INDEX,
@@ -42,7 +39,6 @@ from tdgc.tasks import rewards
 from tdgc.tasks.high_env import command_share, high_step
 from tdgc.tasks.probes import NUM_PROBES, PROBES
 from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
-from tdgc.tasks.rules import OUTCOMES
 
 FORMAT = "tdgc-trace"
 VERSION = 2
@@ -227,8 +223,8 @@ class Tracer:
                 columns[c.name] = np.array([row[c.name][k] for row in rows], dtype=kind)
                 if c.name in _DECIDED:  # a fellow robot's decision was noted beside its end
                     columns[c.name][-1] = None if kind is object else np.nan
-            place = (cell.policy, cell.condition, cell.family, cell.level, cell.first + k)
-            result.append(Trace(*place, self._seed, OUTCOMES[self._outcome[k]], columns))
+            record = cell.record(k, self._seed, self._outcome[k])
+            result.append(Trace(**record, columns=columns))
         return result
 
     # ------------------------------------------------------------------ a row
@@ -330,7 +326,7 @@ class Selection:
     which: Literal["all", "failed"] | int
 
     @classmethod
-    def parse(cls, text: str) -> Selection:
+    def parse(cls, text: str) -> "Selection":
         """``all``, ``failed`` or a number.
 
         Raises:
@@ -348,16 +344,6 @@ class Selection:
         if isinstance(self.which, int):
             return trace.episode < self.which
         return self.which == "all" or trace.outcome != "reached"
-
-
-def check_installed() -> None:
-    """Refuse to go on without pyarrow.
-
-    Raises:
-        TraceError: it is not installed; the message says what to install.
-    """
-    if importlib.util.find_spec("pyarrow") is None:
-        raise TraceError(f"traces need pyarrow: {install_hint('trace')}")
 
 
 def _fields() -> list[tuple[str, Any, dict[str, str]]]:
@@ -382,7 +368,7 @@ def _about(field: Any) -> dict[str, str]:
 
 def write(trace: Trace, folder: str | Path) -> Path:
     """Write ``trace`` into ``folder`` under its ``file_name``, whole or not at all; its path."""
-    check_installed()
+    require("a trace", ("pyarrow",), "trace")
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -392,8 +378,7 @@ def write(trace: Trace, folder: str | Path) -> Path:
     meta |= {f.name: str(getattr(trace, f.name)) for f in _META}
     table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=meta))
     path = Path(folder) / trace.file_name
-    partial = path.with_suffix(f".{os.getpid()}.tmp")
-    try:
+    with atomic(path) as partial:
         pq.write_table(
             table,
             partial,
@@ -403,9 +388,6 @@ def write(trace: Trace, folder: str | Path) -> Path:
             write_statistics=False,
             write_page_checksum=True,
         )
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path
 
 
@@ -415,7 +397,7 @@ def read(path: str | Path) -> Trace:
     Raises:
         TraceError: no such file, one that is damaged, no trace, or of another version.
     """
-    check_installed()
+    require("a trace", ("pyarrow",), "trace")
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -442,7 +424,7 @@ def read(path: str | Path) -> Trace:
     if table is None or table.num_rows < 2:
         raise TraceError(f"{path}: its columns are not those of a trace of version {VERSION}")
     try:
-        head = {f.name: int(meta[f.name]) if f.type == "int" else meta[f.name] for f in _META}
+        head = {f.name: int(meta[f.name]) if f.type is int else meta[f.name] for f in _META}
     except (KeyError, ValueError) as error:
         raise TraceError(f"{path}: does not say which episode it is of") from error
     columns = {c.name: table[c.name].to_numpy(zero_copy_only=False) for c in COLUMNS}

@@ -1,7 +1,5 @@
 """The low policy alone, on a plane: how it tracks commands in each gait, how often it falls."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator
 from typing import Any
@@ -9,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.benchmark.evaluation import Spread, low_config, spread
+from tdgc.benchmark.evaluation import low_config
 from tdgc.config import CommandRanges
+from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy
 from tdgc.sim.commands import CONTINUOUS, INDEX
 from tdgc.sim.gaits import GAITS, gait_embedding
@@ -110,11 +109,11 @@ def _track(job: tuple[str, int, int], low: Policy) -> dict[str, float]:
 
 
 def tracking(
-    low: Policy, episodes: int, seed: int, workers: int, share_out: Spread = spread
+    low: Policy, episodes: int, seed: int, workers: int, run: RunJobs = run_jobs
 ) -> dict[str, Any]:
-    """tracking.json: each gait's tracking and the falls; ``share_out`` is a kind of ``spread``."""
+    """tracking.json: each gait's tracking and the falls; ``run`` is where the work is done."""
     robots = max(1, round(_FALL_SHARE * episodes))
     jobs = [(gait, episodes, seed) for gait in GAITS] + [("", robots, seed)]
-    results = list(share_out(functools.partial(_track, low=low), jobs, workers))
+    results = list(run(functools.partial(_track, low=low), jobs, workers))
     falls = results.pop()
     return {"gaits": dict(zip(GAITS, results, strict=True)), **falls}

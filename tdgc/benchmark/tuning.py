@@ -11,8 +11,6 @@ beyond the bound changes. In JSON, all keys optional:
     }
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

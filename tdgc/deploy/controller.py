@@ -4,8 +4,6 @@ The export's check does so in Bullet, ``tdgc.mujoco`` in MuJoCo, and a robot's o
 the same (docs/deploy.md).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import time
@@ -199,11 +197,7 @@ class Controller:
         self._reached_at: int | None = None
 
     def sense(
-        self,
-        state: RobotState,
-        goal: Array,
-        family: str,
-        ground: Callable[[Array, Array], Array],
+        self, state: RobotState, goal: Array, family: str, ground: Callable[[Array, Array], Array]
     ) -> dict[str, Array]:
         """What the sensors and the map of a simulated robot say: inputs of the graphs by name, and
         its heading ``yaw``, which logs may have.
@@ -231,6 +225,7 @@ class Controller:
             "goal": heading @ (goal - position[:2]),
             "family": np.eye(len(families))[families.index(told)],
             "probes": ground(points[:, 0], points[:, 1]) - plane,
+            "probe_age": np.zeros(1),
         }
 
     def step(self, readings: dict[str, Array]) -> Array:

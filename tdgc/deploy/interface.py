@@ -3,18 +3,15 @@
 ``tdgc.export`` writes one for each graph; ``interface.schema.json`` describes every field.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
-import importlib.util
 import json
 import textwrap
 from pathlib import Path
 from typing import Any
 
 from tdgc.config import read_json
-from tdgc.errors import InputError, install_hint
+from tdgc.errors import InputError
 
 #: Of the interface files; any change of what they hold is a new one.
 VERSION = 2
@@ -25,17 +22,6 @@ Table = dict[str, Any]
 
 class ExportError(InputError):
     """An export that cannot be used; the message is one line."""
-
-
-def require(what: str, names: tuple[str, ...], extra: str) -> None:
-    """Refuse to do something without the packages of an optional extra that it needs.
-
-    Raises:
-        ExportError: names those that are missing and what to install.
-    """
-    missing = [name for name in names if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ExportError(f"{what} needs {', '.join(missing)}: {install_hint(extra)}")
 
 
 def interface_path(folder: Path, name: str) -> Path:

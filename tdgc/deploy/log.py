@@ -7,8 +7,6 @@ array (rows, size) per value, or ``.csv``, with a column per entry, ``gravity_0`
 lists the values.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +32,8 @@ from tdgc.sim.terrain import file_label
 
 SENSED = ("gravity", "joint_angles", "joint_speeds", "goal")  # in every row
 GIVEN = ("clock", "commands", "joint_targets")  # in every row but the last
-DECIDED = ("family", "probes", "decision")  # where ``high`` decided, and empty (NaN) in other rows
+# Where ``high`` decided, and empty (NaN) in other rows.
+DECIDED = ("family", "probes", "probe_age", "decision")
 #: What a log may lack if no graph takes it: angular velocity, and the heading in rad on the map
 #: that has the goal. Without both, velocity and yaw rate are not known; the gyro alone drifts.
 OPTIONAL = {"gyro": 3, "yaw": 1}

@@ -5,8 +5,6 @@ workers' arrays) and ``state.json`` (counters, random states, the rest of the wo
 checksum of all of it). No file can run code.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -58,7 +56,7 @@ class Checkpoint:
         return int(self.header["num_timesteps"])
 
     @classmethod
-    def take(cls, model: BaseAlgorithm, extra: dict[str, Any]) -> Checkpoint:
+    def take(cls, model: BaseAlgorithm, extra: dict[str, Any]) -> "Checkpoint":
         """Of a learner between two updates, and of ``extra``."""
         tensors = {f"policy.{k}": v for k, v in model.policy.state_dict().items()}
         optimiser = model.policy.optimizer.state_dict()
@@ -83,7 +81,7 @@ class Checkpoint:
         return cls(tensors | random_tensors, header)
 
     @classmethod
-    def read(cls, path: Path) -> Checkpoint:
+    def read(cls, path: Path) -> "Checkpoint":
         """From its folder.
 
         Raises:
@@ -107,7 +105,7 @@ class Checkpoint:
             raise CheckpointError(f"{path}: cannot be read: {error}") from error
 
     @classmethod
-    def newest(cls, run: Path, warn: Callable[[str], None]) -> Checkpoint:
+    def newest(cls, run: Path, warn: Callable[[str], None]) -> "Checkpoint":
         """The newest of a run that can be read; damaged ones are passed over with a warning.
 
         Raises:

@@ -1,11 +1,10 @@
 """The flags of both trainers, and the configuration that follows from them."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
-from tdgc.config import Config, ConfigError, read_json, recorded, to_dict, with_overrides
+from tdgc.config import ConfigError, read_json, recorded, to_dict, with_overrides
+from tdgc.config.settings import Config
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.worker import MakeLink, ProcessLink

@@ -2,11 +2,12 @@
 
 The apprentice acts, the teacher says at every decision what it would have done, and the recurrent
 policy learns to say so from its own observations: DAgger (Ross et al. 2011), with a teacher that
-knows more than its student (Chen et al. 2019, "Learning by cheating"). The critic learns what these
-episodes return, so that PPO goes on with a critic that knows the policy.
+knows more than its student (Chen et al. 2019, "Learning by cheating"). Of the steps of a leap the
+teacher says what each frequency would cost, and the policy learns the cheapest (Ross and Bagnell
+2014, AggreVaTe): with the teacher's frequency itself as the only target it learned a mean of two
+ways over a trench, which leads into it. The critic learns what these episodes return, so that PPO
+goes on with a critic that knows the policy.
 """
-
-from __future__ import annotations
 
 from typing import Any, cast
 
@@ -16,18 +17,25 @@ from gymnasium import spaces
 from torch import nn
 
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
-from tdgc.sim.commands import NUM_ACTIONS
+from tdgc.sim.commands import INDEX, NUM_ACTIONS
+from tdgc.tasks.high_env import GUIDANCE
+from tdgc.tasks.leaps import FREQUENCIES
+
+_FREQUENCY = INDEX["frequency"]
+# As in the comparison of docs/experiments.md: what a price weighs against a squared error in the
+# action, and what is left of that error of a frequency that has a price.
+_PRICE_WEIGHT, _PRICED = 4.0, 0.1
 
 
 class ApprenticePolicy(FastRecurrentPolicy):
-    """``FastRecurrentPolicy`` on observations that the teacher's 13 actions follow, unseen."""
+    """``FastRecurrentPolicy`` on observations that the teacher's guidance follows, unseen."""
 
     def __init__(self, observation_space: spaces.Box, *args: Any, **kwargs: Any) -> None:
-        self.seen = observation_space.shape[0] - NUM_ACTIONS
+        self.seen = observation_space.shape[0] - GUIDANCE
         own = spaces.Box(observation_space.low[: self.seen], observation_space.high[: self.seen])
-        super().__init__(own, *args, **kwargs)
-        # A likelihood of fixed width: the noise is what exploration is to begin with.
-        self.log_std.requires_grad_(False)
+        # Gradients of squared errors of actions are below SB3's eps of 1e-5 in the end.
+        super().__init__(own, *args, optimizer_kwargs={"eps": 1e-8, "fused": True}, **kwargs)
+        self.log_std.requires_grad_(False)  # what exploration is to begin with
 
     def forward(self, obs: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         return super().forward(obs[..., : self.seen], *args, **kwargs)
@@ -38,33 +46,50 @@ class ApprenticePolicy(FastRecurrentPolicy):
     def predict_values(self, obs: th.Tensor, *args: Any) -> th.Tensor:  # type: ignore[override]
         return super().predict_values(obs[..., : self.seen], *args)
 
-    def evaluate_actions(self, obs: th.Tensor, *args: Any) -> Any:  # type: ignore[override]
-        return super().evaluate_actions(obs[..., : self.seen], *args)
+    def unroll(self, obs: th.Tensor, *args: Any) -> tuple[th.Tensor, th.Tensor]:
+        return super().unroll(obs[..., : self.seen], *args)
+
+
+def expected_price(frequency: th.Tensor, price: th.Tensor, limit: float) -> th.Tensor:
+    """Price of frequencies (n,), actions from -limit to limit, where ``price`` (n, FREQUENCIES)
+    has it at even steps: a mean over about two steps, so that its slope is felt from afar."""
+    grid = th.linspace(-limit, limit, FREQUENCIES, device=price.device)
+    step = 2.0 * limit / (FREQUENCIES - 1)
+    near = th.softmax(-0.5 * ((grid - frequency[:, None]) / step).square(), dim=1)
+    return (near * price).sum(1)
+
+
+def imitation_loss(mean: th.Tensor, guidance: th.Tensor, limit: float) -> th.Tensor:
+    """How far actions (n, 13) are from what ``guidance`` (n, GUIDANCE) asks for, (n,)."""
+    taught, price = guidance[:, :NUM_ACTIONS], guidance[:, NUM_ACTIONS:]
+    error = (mean - taught).square()
+    weight = th.ones_like(error)
+    weight[:, _FREQUENCY] = th.where(price.amax(1) > 0.0, _PRICED, 1.0)
+    cost = expected_price(mean[:, _FREQUENCY], price, limit)
+    return ((weight * error).sum(1) + _PRICE_WEIGHT * cost) / NUM_ACTIONS
 
 
 class Apprentice(FastRecurrentPPO):
-    """``FastRecurrentPPO`` that learns the teacher's actions instead of better ones."""
+    """``FastRecurrentPPO`` that learns what the teacher asks for instead of better actions."""
 
     def train(self) -> None:
-        """One update: the likelihood of the teacher's actions, and the critic's squared error."""
+        """One update: ``imitation_loss``, and the critic's squared error."""
         policy = cast(ApprenticePolicy, self.policy)
         policy.set_training_mode(True)
         self._update_learning_rate(policy.optimizer)
+        limit = float(cast(spaces.Box, self.action_space).high[_FREQUENCY])
         losses, value_losses = [], []
         for _ in range(self.n_epochs):
             for batch in self.rollout_buffer.get(self.batch_size):
                 observations = batch.observations
-                values, log_prob, _ = policy.evaluate_actions(
-                    observations,
-                    observations[:, policy.seen :],
-                    cast(Any, batch).lstm_states,
-                    cast(Any, batch).episode_starts,
+                mean, values = policy.unroll(
+                    observations, cast(Any, batch).lstm_states, cast(Any, batch).episode_starts
                 )
-                imitation = -log_prob.mean()
+                imitation = imitation_loss(mean, observations[:, policy.seen :], limit).mean()
                 value_loss = nn.functional.mse_loss(values.flatten(), batch.returns)
                 policy.optimizer.zero_grad()
-                (imitation + self.vf_coef * value_loss).backward()
-                nn.utils.clip_grad_norm_(policy.parameters(), self.max_grad_norm)
+                loss = imitation + self.vf_coef * value_loss
+                loss.backward()  # type: ignore[no-untyped-call]
                 policy.optimizer.step()
                 losses.append(imitation.item())
                 value_losses.append(value_loss.item())

@@ -1,46 +1,21 @@
 """What both trainers tell SB3's PPO: the settings they share, and learning rates."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch as th
 
+from tdgc.config import PPOConfig, RecurrentPPOConfig
 
-class SharedSettings(Protocol):
-    """Settings that ``PPOConfig`` and ``RecurrentPPOConfig`` have in common."""
-
-    @property
-    def n_steps(self) -> int: ...
-    @property
-    def n_epochs(self) -> int: ...
-    @property
-    def gamma(self) -> float: ...
-    @property
-    def gae_lambda(self) -> float: ...
-    @property
-    def clip_range(self) -> float: ...
-    @property
-    def ent_coef(self) -> float: ...
-    @property
-    def vf_coef(self) -> float: ...
-    @property
-    def max_grad_norm(self) -> float: ...
+_SHARED = (
+    "n_steps", "n_epochs", "gamma", "gae_lambda", "clip_range", "ent_coef", "vf_coef",
+    "max_grad_norm",
+)  # fmt: skip
 
 
-def shared_keywords(ppo: SharedSettings) -> dict[str, Any]:
+def shared_keywords(ppo: PPOConfig | RecurrentPPOConfig) -> dict[str, Any]:
     """Keyword arguments of SB3's PPO and RecurrentPPO."""
-    return {
-        "n_steps": ppo.n_steps,
-        "n_epochs": ppo.n_epochs,
-        "gamma": ppo.gamma,
-        "gae_lambda": ppo.gae_lambda,
-        "clip_range": ppo.clip_range,
-        "ent_coef": ppo.ent_coef,
-        "vf_coef": ppo.vf_coef,
-        "max_grad_norm": ppo.max_grad_norm,
-    }
+    return {name: getattr(ppo, name) for name in _SHARED}
 
 
 @dataclass

@@ -9,8 +9,6 @@ A minibatch holds whole environments, as in OpenAI Baselines' PPO2 for recurrent
 LSTMs see padding, and only where an episode starts within the rollout.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -156,6 +154,20 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         Returns:
             Values (n_seq * length, 1); log probabilities and entropies (n_seq * length,).
         """
+        mean, values = self.unroll(obs, lstm_states, episode_starts)
+        log_prob, entropy = gaussian(actions, mean, self.log_std)
+        if self.gait is not None and self.gait_bonus > 0.0:
+            limit = float(cast(spaces.Box, self.action_space).high[-1])
+            std = self.log_std[-1].exp()
+            gaits = gait_entropy(mean[:, -1], std, limit, self.gait.gaits)
+            entropy = entropy + self.gait_bonus * gaits
+        return values, log_prob, entropy
+
+    def unroll(
+        self, obs: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Mean actions (n_seq * length, size) and values (n_seq * length, 1), as
+        ``evaluate_actions`` has them."""
         n_seq = lstm_states.pi[0].shape[1]
         starts = episode_starts.view(n_seq, -1) > 0.0
         length = starts.shape[1]
@@ -179,14 +191,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         latent_pi = run(self.lstm_actor, lstm_states.pi)
         latent_vf = run(cast(nn.LSTM, self.lstm_critic), lstm_states.vf)
         values = self.value_net(self.mlp_extractor.forward_critic(latent_vf))
-        mean = self.action_net(self.mlp_extractor.forward_actor(latent_pi))
-        log_prob, entropy = gaussian(actions, mean, self.log_std)
-        if self.gait is not None and self.gait_bonus > 0.0:
-            limit = float(cast(spaces.Box, self.action_space).high[-1])
-            std = self.log_std[-1].exp()
-            gaits = gait_entropy(mean[:, -1], std, limit, self.gait.gaits)
-            entropy = entropy + self.gait_bonus * gaits
-        return values, log_prob, entropy
+        return self.action_net(self.mlp_extractor.forward_actor(latent_pi)), values
 
 
 def gaussian(x: th.Tensor, mean: th.Tensor, log_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -6,8 +6,6 @@ files, ``policy.safetensors`` with ``policy.json`` (the last policy, ready to be
 episodes, as if it had not been stopped.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import json
@@ -20,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -29,23 +27,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tqdm import tqdm
 
 from tdgc import policies
-from tdgc.config import to_dict
+from tdgc.config import HighTrainConfig, LowTrainConfig, to_dict
 from tdgc.learn.checkpoints import Checkpoint
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import MakeLink, WorkerError, memory_mb
-
-
-class TrainConfig(Protocol):
-    """What the configurations of both trainers have in common."""
-
-    @property
-    def steps(self) -> int: ...
-
-    @property
-    def log_steps(self) -> int: ...
-
-    @property
-    def checkpoint_seconds(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -105,7 +90,7 @@ class Run:
     """
 
     folder: Path
-    config: TrainConfig
+    config: LowTrainConfig | HighTrainConfig
     meta: dict[str, Any]
     summarise: Callable[[dict[str, float]], dict[str, float]]
     interruption: Interruption

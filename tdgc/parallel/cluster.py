@@ -5,10 +5,7 @@ machine a worker or a batch of episodes goes to. Nothing else here knows Ray, an
 it before it is asked for.
 """
 
-from __future__ import annotations
-
 import copy
-import importlib.util
 import itertools
 import logging
 import os
@@ -16,6 +13,7 @@ import re
 import signal
 import socket
 import time
+import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -23,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc import __version__
-from tdgc.errors import InputError, install_hint
+from tdgc.errors import InputError, require
 from tdgc.parallel.worker import BLAS_THREADS, Beginning, MakeTask, Worker, WorkerError, keep_memory
 from tdgc.state import State, copies
 
@@ -59,10 +57,10 @@ def connect(address: str) -> int:
         CPUs of the cluster.
 
     Raises:
-        ClusterError: Ray is not installed, no cluster answers, or a node cannot be used.
+        InputError: Ray is not installed.
+        ClusterError: no cluster answers, or a node cannot be used.
     """
-    if importlib.util.find_spec("ray") is None:
-        raise ClusterError(f"--cluster needs Ray: {install_hint('cluster')}")
+    require("--cluster", ("ray",), "cluster")
     import ray
 
     if not ray.is_initialized():
@@ -87,26 +85,25 @@ def check_workers(workers: int, cpus: int) -> None:
 
 def _join(address: str) -> None:
     import ray
-    from ray._private.services import canonicalize_bootstrap_address_or_die, extract_ip_port
 
-    try:
-        found = canonicalize_bootstrap_address_or_die(address)
-        # Ray itself would wait for many minutes for a cluster that is gone.
-        socket.create_connection(extract_ip_port(found), _REACH_SECONDS).close()
-    except (OSError, ValueError):
-        raise ClusterError(
-            f"--cluster {address}: no cluster of Ray answers; allowed: host:port, or auto for the "
-            "one that RAY_ADDRESS names or that runs on this machine"
-        ) from None
     before = signal.getsignal(signal.SIGTERM)
     try:
+        named = os.environ.get("RAY_ADDRESS", "auto") if address == "auto" else address
+        if named != "auto":  # Ray itself would wait for many minutes for a cluster that is gone.
+            place = urllib.parse.urlsplit(f"//{named}")
+            socket.create_connection((place.hostname, place.port or 0), _REACH_SECONDS).close()
         ray.init(
             address=address,
             runtime_env={"env_vars": dict.fromkeys(BLAS_THREADS, "1")},  # see one_blas_thread
             log_to_driver=False,
             logging_level=logging.WARNING,
         )
-    except (OSError, RuntimeError, ValueError) as error:
+    except (OSError, ValueError):
+        raise ClusterError(
+            f"--cluster {address}: no cluster of Ray answers; allowed: host:port, or auto for the "
+            "one that RAY_ADDRESS names or that runs on this machine"
+        ) from None
+    except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise ClusterError(f"--cluster {address}: cannot be joined: {reason}") from error
     finally:
@@ -158,11 +155,7 @@ class _Actor:
     """A worker on some node. Its answers are (answer, arrays that it changed, pid, address)."""
 
     def start(
-        self,
-        make_task: MakeTask,
-        views: dict[str, NDArray[Any]],
-        seed: int,
-        state: State | None,
+        self, make_task: MakeTask, views: dict[str, NDArray[Any]], seed: int, state: State | None
     ) -> tuple[Any, ...]:
         self._views = copies(views)
         self._worker = Worker(make_task, self._views, seed, state)
@@ -271,7 +264,7 @@ def _run(work: Callable[[Job], Result], job: Job) -> Result:
     return work(job)
 
 
-def spread(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
+def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
     """``work`` on each job, in order, on ``workers`` CPUs of the cluster at most.
 
     A job whose node is lost is done again on another one.

@@ -4,8 +4,6 @@ The learner waits while its workers collect and they wait while it learns, so th
 workers as cores. A step of a worker has fixed costs in numpy, which few robots do not pay for.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

@@ -4,8 +4,6 @@ So some can be on a plane, where a control step costs less than half, while othe
 and however many workers there are, each has its share of both.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 

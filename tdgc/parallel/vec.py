@@ -1,7 +1,5 @@
 """Many robots in a few workers behind Stable-Baselines3's VecEnv; workers that fail are mended."""
 
-from __future__ import annotations
-
 import atexit
 import itertools
 from collections import deque

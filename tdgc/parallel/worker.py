@@ -8,8 +8,6 @@ Nothing here imports PyTorch or Stable-Baselines3, and neither does the low poli
 would take 150 MB more.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import math
@@ -47,8 +45,8 @@ class Task(Protocol):
     """
 
     num_robots: int
-    observation_space: gym.spaces.Box[Any]
-    action_space: gym.spaces.Box[Any]
+    observation_space: "gym.spaces.Box[Any]"
+    action_space: "gym.spaces.Box[Any]"
 
     def reset(self, index: NDArray[np.integer]) -> None: ...
 
@@ -342,10 +340,7 @@ class ProcessLink:
         self._worker = worker
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve,
-            args=(theirs, beginning),
-            daemon=True,
-            name=f"tdgc-worker-{worker}",
+            target=_serve, args=(theirs, beginning), daemon=True, name=f"tdgc-worker-{worker}"
         )
         with one_blas_thread(), _without_script(beginning.make_task):
             self._process.start()

@@ -4,8 +4,6 @@ Whoever loads a policy and acts needs no SB3, so what is defined on it is import
 asked for.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

@@ -1,7 +1,5 @@
 """The side that acts: a policy's file loaded, without SB3."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import os

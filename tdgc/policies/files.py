@@ -21,8 +21,6 @@ action), ``critic.*`` likewise (the last one gives the value), ``log_std``, and 
 ``bias_hh`` (gate order i, f, g, o as in PyTorch).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json
@@ -41,6 +39,7 @@ import torch as th
 from torch import nn
 
 from tdgc.errors import InputError
+from tdgc.files import atomic
 
 FORMAT = "tdgc-policy"
 VERSION = 1
@@ -75,7 +74,7 @@ class Mirror:
     action_index: tuple[int, ...]
     action_sign: tuple[float, ...]
 
-    def actor_part(self, size: int) -> Mirror:
+    def actor_part(self, size: int) -> "Mirror":
         """The same for the first ``size`` entries of the observation.
 
         Raises:
@@ -159,7 +158,7 @@ class Header:
             raise ValueError(f"meta cannot be written as JSON: {error}") from None
 
     @classmethod
-    def from_json(cls, text: str) -> tuple[Header, str]:
+    def from_json(cls, text: str) -> tuple["Header", str]:
         """Header and checksum from the text of ``NAME.json``.
 
         Raises:
@@ -317,15 +316,10 @@ def _with_suffix(stem: Path, suffix: str) -> Path:
 
 
 def _write(path: Path, data: bytes) -> None:
-    temporary = path.parent / f".{path.name}.{os.getpid()}.tmp"
-    try:
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic(path) as partial, open(partial, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:

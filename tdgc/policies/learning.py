@@ -1,7 +1,5 @@
 """The side that learns: an SB3 policy whose critic sees more than its actor, and its saving."""
 
-from __future__ import annotations
-
 import os
 from typing import Any, cast
 
@@ -10,11 +8,7 @@ from gymnasium import spaces
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import (
-    FlattenExtractor,
-    MlpExtractor,
-    create_mlp,
-)
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor, create_mlp
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 

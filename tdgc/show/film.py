@@ -4,14 +4,10 @@ A frame is the robot on its tile, seen from behind and to the right, with its co
 and a gait diagram of the last seconds under it. MP4 needs PyAV, the extra ``video``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
-import importlib.util
-import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -21,10 +17,12 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
-from tdgc.benchmark.evaluation import spread, tile_of
+from tdgc.benchmark.evaluation import tile_of
 from tdgc.benchmark.recording import Recording, spans, stretches
 from tdgc.config import PhysicsConfig, RobotConfig
-from tdgc.errors import install_hint
+from tdgc.errors import InputError, require
+from tdgc.files import atomic
+from tdgc.parallel.jobs import run_jobs
 from tdgc.show.plots import GAIT_COLOURS, POLICY_COLOURS, sheet
 from tdgc.sim.commands import CONTINUOUS, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
@@ -56,20 +54,6 @@ _INK, _GREY, _PALE = (30, 34, 40), (125, 130, 138), (226, 228, 232)
 _WANTED, _MARK = (176, 205, 235), (213, 94, 0)  # desired contact; what was measured
 
 _MEASURED = ("vx", "vy", "yaw_rate", "body_height")  # commands that a recording has measured
-
-
-class FilmError(RuntimeError):
-    """A film that cannot be written; the message is one line."""
-
-
-def check_installed() -> None:
-    """Refuse MP4 without PyAV.
-
-    Raises:
-        FilmError: it is not installed; the message says what to install.
-    """
-    if importlib.util.find_spec("av") is None:
-        raise FilmError(f"MP4 needs PyAV: {install_hint('video')}")
 
 
 # ---------------------------------------------------------------------------- the stage
@@ -144,7 +128,8 @@ def set_stage(
 @contextlib.contextmanager
 def staged(recording: Recording, trail: bool = False) -> Iterator[Stage]:
     """The stage of ``recording``; ``trail`` paints the base's way on the ground."""
-    tile = tile_of(recording.seed, recording.family, recording.level, recording.episode)
+    r = recording
+    tile = tile_of(r.seed, r.family, r.level, r.episode, r.condition)
     way = recording.position[:, :2] if trail else None
     stage = set_stage(tile, recording.robot, way=way, colour=POLICY_COLOURS[recording.policy])
     try:
@@ -278,62 +263,46 @@ def _frame_steps(recording: Recording) -> int:
 # ---------------------------------------------------------------------------- files
 
 
-class _Mp4:
-    """An MP4 file that is there once it is whole."""
+@contextlib.contextmanager
+def _mp4(path: Path, rate: Fraction) -> Iterator[Callable[[Image.Image], None]]:
+    """An MP4 file that is there once it is whole; a function that adds a frame."""
+    require("MP4", ("av",), "video")
+    import av
 
-    def __init__(self, path: Path, rate: Fraction) -> None:
-        check_installed()
-        import av
+    with atomic(path) as partial, av.open(str(partial), "w", format="mp4") as file:
+        stream: Any = file.add_stream("libx264", rate=rate, options={"crf": "23"})
+        stream.width, stream.height = SIZE
+        stream.pix_fmt = "yuv420p"  # what browsers and players can show
 
-        self._path, self._partial = path, path.with_suffix(f".{os.getpid()}.tmp")
-        self._file = av.open(str(self._partial), "w", format="mp4")
-        self._stream: Any = self._file.add_stream("libx264", rate=rate, options={"crf": "23"})
-        self._stream.width, self._stream.height = SIZE
-        self._stream.pix_fmt = "yuv420p"  # what browsers and players can show
+        def add(image: Image.Image) -> None:
+            frame = av.VideoFrame.from_ndarray(np.asarray(image), format="rgb24")
+            file.mux(stream.encode(frame))
 
-    def __enter__(self) -> _Mp4:
-        return self
-
-    def add(self, image: Image.Image) -> None:
-        from av import VideoFrame
-
-        self._file.mux(
-            self._stream.encode(VideoFrame.from_ndarray(np.asarray(image), format="rgb24"))
-        )
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            if kind is None:
-                self._file.mux(self._stream.encode())
-            self._file.close()
-            if kind is None:
-                os.replace(self._partial, self._path)
-        finally:
-            self._partial.unlink(missing_ok=True)
+        yield add
+        file.mux(stream.encode())
 
 
 def film(recording: Recording, folder: Path, mp4: bool = True) -> None:
     """Write ``film_<name>.gif`` and, with ``mp4``, ``film_<name>.mp4``, each whole or not at all.
 
     Raises:
-        FilmError: ``mp4`` without PyAV.
+        InputError: ``mp4`` without PyAV.
         OSError: a file cannot be written.
     """
     stem = folder / f"film_{recording.name}"
     rate = 1 / Fraction(recording.dt * _frame_steps(recording)).limit_denominator(1000)
     small: list[Image.Image] = []
-    with _Mp4(stem.with_suffix(".mp4"), rate) if mp4 else contextlib.nullcontext() as file:
+    with _mp4(stem.with_suffix(".mp4"), rate) if mp4 else contextlib.nullcontext() as add:
         for k, frame in enumerate(frames(recording)):
-            if file is not None:
-                file.add(frame)
+            if add is not None:
+                add(frame)
             if k % GIF_EVERY == 0:
                 size = (SIZE[0] // GIF_SCALE, SIZE[1] // GIF_SCALE)
                 reduced = frame.resize(size, Image.Resampling.LANCZOS)
                 # Of Pillow's methods the one that keeps the robot's orange, in half the bytes.
                 method = Image.Quantize.FASTOCTREE
                 small.append(reduced.quantize(method=method, dither=Image.Dither.NONE))
-    partial = stem.with_suffix(f".{os.getpid()}.tmp")
-    try:
+    with atomic(stem.with_suffix(".gif")) as partial:
         small[0].save(
             partial,
             format="GIF",
@@ -342,9 +311,6 @@ def film(recording: Recording, folder: Path, mp4: bool = True) -> None:
             duration=round(1000 * GIF_EVERY / rate),
             loop=0,
         )
-        os.replace(partial, stem.with_suffix(".gif"))
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def moments(recording: Recording) -> list[int]:
@@ -395,12 +361,8 @@ def strip(recordings: Sequence[Recording], folder: Path) -> Path:
                 draw.text((x + _SHOT[0] - 36, y + 19), time, _INK, _font(14), "mm")
     suffix = "" if first.condition == "nominal" else f"_{first.condition}"
     path = folder / f"strip_{file_label(first.family)}_{first.level}{suffix}.png"
-    partial = path.with_suffix(f".{os.getpid()}.tmp")
-    try:
+    with atomic(path) as partial:
         image.save(partial, format="PNG")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path
 
 
@@ -429,8 +391,8 @@ def produce(recordings: Sequence[Recording], folder: Path, workers: int) -> list
     """
     problems = []
     try:
-        check_installed()
-    except FilmError as error:
+        require("MP4", ("av",), "video")
+    except InputError as error:
         problems.append(str(error))
     jobs: list[_Job] = [("film", [r]) for r in recordings]
     cells: dict[tuple[str, str, int], list[Recording]] = {}
@@ -440,7 +402,7 @@ def produce(recordings: Sequence[Recording], folder: Path, workers: int) -> list
     jobs += [("strip", rows) for rows in cells.values()]
     work = functools.partial(_produce, folder=folder, mp4=not problems)
     with tqdm(total=len(jobs), unit="film", dynamic_ncols=True) as bar:
-        for problem in spread(work, jobs, workers):
+        for problem in run_jobs(work, jobs, workers):
             problems += [problem] if problem else []
             bar.update()
     return problems

@@ -4,8 +4,6 @@ The window only shows the robot; it is simulated apart, as everywhere else. So n
 to the window changes what the robot does, except through the sliders.
 """
 
-from __future__ import annotations
-
 import time
 
 import numpy as np
@@ -153,7 +151,7 @@ def watch(low: Policy, driver: Driver, cell: Cell, seed: int) -> None:
     stage = set_stage(tile, low_config(low).robot, window=True)
     try:
         monitor = Monitor(stage)
-        run_cell(cell, low, driver, seed, monitor)
+        run_cell(cell, low, driver, seed, [monitor])
         while True:
             stage.follow(monitor.text)
             time.sleep(_TEXT_SECONDS)

@@ -1,10 +1,7 @@
 """Figures: files of rows, logs and recordings in, PNG out. Nothing here simulates or trains."""
 
-from __future__ import annotations
-
 import csv
 import json
-import os
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +24,7 @@ from matplotlib.ticker import MaxNLocator
 from tdgc.benchmark.evaluation import POSE_SECONDS, tile_of
 from tdgc.benchmark.recording import Recording, spans, stretches
 from tdgc.benchmark.results import policies_of
+from tdgc.files import atomic
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array, wrap_angle
@@ -47,12 +45,10 @@ _DRAWN = 3  # episodes a family and policy in the figure of trajectories
 
 
 def _save(figure: Figure, out: Path) -> None:
-    partial = out.with_suffix(".tmp")
     try:
-        figure.savefig(partial, dpi=120, format="png")
-        os.replace(partial, out)
+        with atomic(out) as partial:
+            figure.savefig(partial, dpi=120, format="png")
     finally:
-        partial.unlink(missing_ok=True)
         plt.close(figure)
 
 
@@ -248,7 +244,9 @@ def trajectories(folder: Path, out: Path) -> None:
     for row, (family, level) in zip(axes, hardest.items(), strict=True):
         mine = [run for run in runs if run.row["family"] == family]
         tiles = [
-            tile_of(int(run.row["seed"]), family, level, int(run.row["episode"])).heights
+            tile_of(
+                int(run.row["seed"]), family, level, int(run.row["episode"]), run.row["condition"]
+            ).heights
             for run in mine
         ]
         low, high = float(np.min(tiles)), float(np.max(tiles))
@@ -313,11 +311,7 @@ def sheet(recording: Recording, out: Path) -> None:
     # Gait and contacts, then the four commands that were measured, then the others.
     ratios = [1.7] + [1.0] * 4 + [0.6] * (len(CONTINUOUS) - 4)
     figure, axes = plt.subplots(
-        len(ratios),
-        1,
-        figsize=(12, 13.5),
-        sharex=True,
-        height_ratios=ratios,
+        len(ratios), 1, figsize=(12, 13.5), sharex=True, height_ratios=ratios
     )
     figure.subplots_adjust(left=0.11, right=0.985, top=0.965, bottom=0.065, hspace=0.12)
     _draw_contacts(axes[0], r)

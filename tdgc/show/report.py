@@ -5,13 +5,10 @@ The page needs nothing but itself: pictures and films are inside as data URIs, a
 module; Jinja escapes all that goes into it.
 """
 
-from __future__ import annotations
-
 import base64
 import csv
 import glob
 import json
-import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -21,14 +18,10 @@ from typing import Any
 import jinja2
 
 import tdgc
-from tdgc.benchmark.diagnosis import LAYERS
-from tdgc.benchmark.evaluation import (
-    CONDITIONS,
-    PUSH_INTERVAL,
-    Condition,
-    EpisodeRecord,
-)
+from tdgc.benchmark.diagnosis import LAYERS, count_failures
+from tdgc.benchmark.evaluation import CONDITIONS, EpisodeRecord
 from tdgc.benchmark.results import PAIRED, policies_of, verdict
+from tdgc.files import atomic
 from tdgc.sim.terrain import file_label
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
@@ -92,36 +85,6 @@ def data_uri(path: Path) -> str:
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
 
 
-def describe_condition(condition: Condition) -> str:
-    """What a condition changes, for people."""
-    changes = []
-    if condition.levels is not None:
-        changes.append(f"levels {', '.join(map(str, condition.levels))}")
-    if condition.families is not None:
-        changes.append(f"terrain {', '.join(condition.families)}, which nothing was trained on")
-    if condition.friction is not None:
-        changes.append(f"friction {condition.friction:g}")
-    if condition.payload > 0.0:
-        changes.append(f"{condition.payload:g} kg on the trunk")
-    if condition.push_speed > 0.0:
-        changes.append(f"pushes of {condition.push_speed:g} m/s every {PUSH_INTERVAL:g} s")
-    if condition.motor != 1.0:
-        changes.append(f"{condition.motor:g} times the torque limits and gains of the joints")
-    if condition.latency > 0.0:
-        changes.append(f"commands reach the joints {1000 * condition.latency:g} ms late")
-    if condition.physics_hz is not None:
-        changes.append(f"physics at {condition.physics_hz} Hz")
-    if condition.noise is not None:
-        noise = condition.noise
-        changes.append(
-            f"noise of the sensors as in training; the gait clock starts at random; height probes "
-            f"off by up to {100 * noise.noise_probes:g} cm and a decision late"
-        )
-    if not condition.told:
-        changes.append('the terrain family is "unknown" to the policy')
-    return "; ".join(changes) or "nothing"
-
-
 def _rows(path: Path) -> list[Row]:
     with open(path, newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
@@ -156,48 +119,11 @@ def _conditions(episodes: Sequence[Row]) -> list[dict[str, Any]]:
         result.append(
             {
                 "name": name,
-                "changes": describe_condition(CONDITIONS[name]),
+                "changes": CONDITIONS[name].what,
                 "families": ", ".join(_distinct(rows, "family")),
                 "levels": ", ".join(_distinct(rows, "level")),
                 "episodes": ", ".join(str(n) for n in sorted(set(cells.values()))),
                 "outcomes": outcomes,
-            }
-        )
-    return result
-
-
-def _diagnoses(diagnoses: Sequence[Row], episodes: Sequence[Row]) -> list[dict[str, Any]]:
-    """Of each policy and condition its failures: by family and level, and where most is to be won.
-
-    A layer's points are the failures that it is to blame for, in per cent of all episodes.
-    """
-    result = []
-    for policy, condition in dict.fromkeys((e["policy"], e["condition"]) for e in episodes):
-        mine = [d for d in diagnoses if (d["policy"], d["condition"]) == (policy, condition)]
-        total = sum((e["policy"], e["condition"]) == (policy, condition) for e in episodes)
-        cells = []
-        for family, level in dict.fromkeys((d["family"], d["level"]) for d in mine):
-            cell = [d for d in mine if (d["family"], d["level"]) == (family, level)]
-            layers = Counter(d["layer"] for d in cell)
-            cause, times = Counter(d["cause"] for d in cell).most_common(1)[0]
-            cells.append(
-                {
-                    "family": family,
-                    "level": level,
-                    "layers": [layers[layer] for layer in LAYERS],
-                    "cause": cause,
-                    "times": times,
-                }
-            )
-        worst = Counter((d["family"], d["layer"]) for d in mine).most_common(1)
-        result.append(
-            {
-                "policy": policy,
-                "condition": condition,
-                "failures": len(mine),
-                "total": total,
-                "cells": cells,
-                "most": [(*where, 100 * count / total) for where, count in worst],
             }
         )
     return result
@@ -316,7 +242,7 @@ def render(folder: Path) -> str:
         outcomes=OUTCOMES,
         figures=[(data_uri(folder / name), title, alt) for name, title, alt in FIGURES],
         layers=LAYERS,
-        diagnoses=_diagnoses(diagnoses, episodes) if has_diagnoses else None,
+        diagnoses=count_failures(diagnoses, episodes) if has_diagnoses else None,
         tuning=_tuning(folder / "tuning.json"),
         tiles=_tiles(films, filmed, diagnoses),
         filmed=len(filmed),
@@ -334,11 +260,7 @@ def write(folder: Path) -> Path:
         OSError, ValueError: as ``render``, or the page cannot be written.
     """
     path = folder / NAME
-    partial = path.with_suffix(f".{os.getpid()}.tmp")
     text = render(folder)
-    try:
+    with atomic(path) as partial:
         partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path

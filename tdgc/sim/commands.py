@@ -19,8 +19,6 @@ index   name           unit   meaning
 ======  =============  =====  ==================================================
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 
@@ -69,11 +67,6 @@ _OBSERVATION_ZERO: NDArray[np.float64] = np.concatenate([default_command()[:12],
 def observed_command(command: NDArray[np.floating]) -> NDArray[np.float64]:
     """Commands (..., 15) as the low policy's network sees them."""
     return np.asarray((command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT)
-
-
-def commands_of(observed: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The inverse: commands (..., 15) from what the network sees of them."""
-    return np.asarray(observed * _OBSERVATION_UNIT + _OBSERVATION_ZERO)
 
 
 class CommandDecoder:

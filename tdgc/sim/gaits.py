@@ -12,8 +12,6 @@ so ``phase`` pairs the diagonals (trot), ``offset`` the front against the rear (
 ``bound`` the left against the right (pace). The first half of a foot's warped phase is stance.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -143,6 +141,10 @@ class PhaseClock:
     def signal(self) -> NDArray[np.float64]:
         """phi_t: sin(2 pi phase) of each foot, (M, 4), as the low policy sees it."""
         return np.sin(2.0 * np.pi * self.phases)
+
+    def cosine(self) -> NDArray[np.float64]:
+        """cos(2 pi phase) of each foot, (M, 4): the sine alone is the same twice in a cycle."""
+        return np.cos(2.0 * np.pi * self.phases)
 
     def begun(self, cycles: float) -> NDArray[np.float64]:
         """Share that is over of a gait's first ``cycles``, (M,) in [0, 1]; 1 if these are 0."""

@@ -6,8 +6,6 @@ about the one to the left; at zero the legs are straight down. What does not fit
 since Bullet would simulate it and everything computed beside Bullet would be wrong without a word.
 """
 
-from __future__ import annotations
-
 import reprlib
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
@@ -189,7 +187,7 @@ class _Part:
     place: Array
     rotation: Array
 
-    def carry(self, joint: Element, link: Element) -> _Part:
+    def carry(self, joint: Element, link: Element) -> "_Part":
         """The part that ``joint`` fixes to this one."""
         place, turn = (_numbers(joint, "origin", key, "0 0 0") for key in ("xyz", "rpy"))
         return _Part(link, self.place + self.rotation @ place, self.rotation @ _rotation(turn))

@@ -6,22 +6,13 @@ knows nothing of rewards or tasks; ``tdgc.tasks.low_env`` trains on it and ``tdg
 drives it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
-from tdgc.sim.commands import (
-    INDEX,
-    NAMES,
-    SIDEWAYS,
-    default_command,
-    gait_index,
-    observed_command,
-)
+from tdgc.sim.commands import INDEX, NAMES, SIDEWAYS, default_command, gait_index, observed_command
 from tdgc.sim.gaits import GAITS, PhaseClock, foot_phases
 from tdgc.sim.geometry import Geometry
 from tdgc.sim.observation import ARROW, JOINTS, LEGS, TURN, Term, in_place, observe
@@ -76,7 +67,7 @@ class Locomotion:
         self.num_robots = num_robots
         self.robot = robot
         self.physics = physics
-        self.layout = actor_layout(gyro)
+        self.layout = actor_layout(robot, gyro)
         self.world = world or World(num_robots, robot, physics, field, visual)
         self.clock = PhaseClock(num_robots)
         self.nominal = nominal_pose(robot)
@@ -253,8 +244,8 @@ class Locomotion:
         self.world.forget()
 
     def observe(self, noise: Noise | None = None) -> NDArray[np.float32]:
-        """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g], (M, 71), and 3 more with a gyro; what
-        is measured carries the ``noise``."""
+        """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g] and the rest of ``actor_layout``, (M,
+        n); what is measured carries the ``noise``."""
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
         return observe(self.layout, self, noise)
 
@@ -271,23 +262,36 @@ def _gait(loco: Locomotion) -> Array:
     return gait_index(loco.command)[:, None] / (len(GAITS) - 1)
 
 
+def _pose(loco: Locomotion) -> Array:
+    return loco.pose() - loco.nominal
+
+
 _FLIP_COMMAND = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in NAMES))
 # fmt: off
 _ACTOR_LAYOUT: tuple[Term[Locomotion], ...] = (
     Term("gravity", 3, lambda loco: loco.world.state.gravity, 1.0, "noise_gravity", ARROW),
     Term("joint_error", 12, _joint_error, 1.0, "noise_joint_angle", JOINTS),
+    Term("pose", 12, _pose, mirror=JOINTS),
     Term("joint_speed", 12, lambda loco: loco.world.state.qd, SPEED_SCALE, "noise_joint_speed",
          JOINTS),
     Term("last_action", 12, lambda loco: loco.actions[0], mirror=JOINTS),
     Term("action_before", 12, lambda loco: loco.actions[1], mirror=JOINTS),
     Term("command", 15, _command, mirror=_FLIP_COMMAND),
     Term("clock", 4, lambda loco: loco.clock.signal(), mirror=LEGS),
+    Term("clock_cosine", 4, lambda loco: loco.clock.cosine(), mirror=LEGS),
     Term("gait", 1, _gait),
     Term("gyro", 3, lambda loco: loco.world.state.body_rate, GYRO_SCALE, "noise_gyro", TURN),
 )
 # fmt: on
 
 
-def actor_layout(gyro: bool) -> tuple[Term[Locomotion], ...]:
-    """s^L of Sec. IV-A, the actor's observation: 71 values, and 3 more with a gyro."""
-    return tuple(term for term in _ACTOR_LAYOUT if gyro or term.name != "gyro")
+# Where joint errors refer to a pose that walks, they do not say how the legs stand, nor does the
+# sine of a phase tell the beginning of a stance from its end.
+_OF_WALKING = ("pose", "clock_cosine")
+
+
+def actor_layout(robot: RobotConfig, gyro: bool) -> tuple[Term[Locomotion], ...]:
+    """s^L of Sec. IV-A, the actor's observation: 71 values, 3 more with a gyro and 16 more where
+    the nominal pose walks."""
+    absent = (() if gyro else ("gyro",)) + (() if robot.commanded_gait else _OF_WALKING)
+    return tuple(term for term in _ACTOR_LAYOUT if term.name not in absent)

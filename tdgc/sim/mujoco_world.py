@@ -4,8 +4,6 @@ Robot, ground and joint control are those of the Bullet world: the same URDF, th
 the same PD law. Contacts, integration and the motors' rotors are MuJoCo's.
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 import xml.etree.ElementTree as ElementTree
@@ -264,7 +262,7 @@ class Window:
     def __init__(self) -> None:
         self._open = contextlib.ExitStack()
 
-    def __enter__(self) -> Window:
+    def __enter__(self) -> "Window":
         check_display()
         return self
 

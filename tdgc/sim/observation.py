@@ -3,8 +3,6 @@
 A layout is a tuple of terms in order; rows, sizes, columns and mirrors follow from it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise

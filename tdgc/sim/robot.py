@@ -5,8 +5,6 @@ torques.
 Every array has a leading axis of M robots. Legs in the order of ``tdgc.sim.gaits.FEET``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -128,7 +126,9 @@ def walking_pose(
     feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * FRONT
     feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * SIDE
     feet[..., :2] += grown[:, None, None] * foot_travel(command, ahead, feet[..., :2])
-    feet[..., 2] -= change[:, INDEX["body_height"], None]
+    # Without its load a nominal pose stands higher than the robot.
+    lift = nominal_height(config, geometry) - config.base_height
+    feet[..., 2] += lift - change[:, INDEX["body_height"], None]
     feet[..., 2] += (grown * command[:, INDEX["swing_height"]])[:, None] * swing_profile(ahead)
     pitch, roll = command[:, INDEX["pitch"], None], command[:, INDEX["roll"], None]
     x, y, z = np.moveaxis(feet, -1, 0)
@@ -184,11 +184,7 @@ FRICTION_SPEED = 1.0  # rad/s at which dry friction is whole: a step below it wo
 
 
 def pd_torque(
-    error: Array,
-    speed: Array,
-    strength: Array,
-    config: RobotConfig,
-    friction: Array | float = 0.0,
+    error: Array, speed: Array, strength: Array, config: RobotConfig, friction: Array | float = 0.0
 ) -> Array:
     """Joint torques of the PD law, limited as the motors are, less what the joints' friction takes.
 
@@ -324,7 +320,7 @@ class RobotState:
     foot_velocity: Array = field(init=False)
 
     @classmethod
-    def zeros(cls, geometry: Geometry, num_robots: int) -> RobotState:
+    def zeros(cls, geometry: Geometry, num_robots: int) -> "RobotState":
         """A state of ``num_robots`` upright robots at the origin."""
         m = num_robots
         quaternion = np.zeros((m, 4))

@@ -1,7 +1,5 @@
 """Noise of the robots' sensors, drawn in training and in the evaluation's condition ``noise``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -12,8 +12,7 @@ look for them in the heights. All lengths are in m, all angles in rad; arrays ar
 so sample [ix, iy] lies at (ix * CELL, iy * CELL).
 """
 
-from __future__ import annotations
-
+import dataclasses
 import functools
 import math
 import re
@@ -131,7 +130,7 @@ class Features:
     pillars: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     slope: float = 0.0
 
-    def __add__(self, other: Features) -> Features:
+    def __add__(self, other: "Features") -> "Features":
         """Those of two stretches of one tile; slopes do not add up, a tile has one at most."""
         return Features(
             np.vstack([self.trenches, other.trenches]),
@@ -174,6 +173,20 @@ class Tile:
     parts: tuple[str, ...]
     features: Features = field(default_factory=Features)
     cell: float = CELL
+
+    def mirrored(self) -> "Tile":
+        """The same tile with left and right exchanged."""
+        found, turned = self.features, np.array([1.0, -1.0, -1.0])
+        pillars = found.pillars.copy()
+        pillars[:, 1] = TILE_SIZE - pillars[:, 1]
+        return dataclasses.replace(
+            self,
+            heights=self.heights[:, ::-1],
+            support=self.support[:, ::-1],
+            start=np.array([0.0, TILE_SIZE, 0.0]) + turned * self.start,
+            goal=np.array([0.0, TILE_SIZE]) + turned[:2] * self.goal,
+            features=dataclasses.replace(found, pillars=pillars, slope=-found.slope),
+        )
 
 
 def difficulty_parameter(family: str, difficulty: float) -> float:
@@ -494,67 +507,6 @@ class TileField:
     def support_at(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """As `height_at`, for the support surface of the fall rule."""
         return interpolate(self.support, self.cell, x, y)
-
-
-class TerrainGrid(TileField):
-    """The paper's grid of tiles in one height field: a row a level, a column a family.
-
-    Attributes
-    ----------
-    levels : (rows,) ints in [0, 12]; the same level may have several rows
-    families : (cols,) names from `ALL_FAMILIES`
-    seed, stream : int
-        See `tile_rng`.
-    """
-
-    def __init__(
-        self,
-        levels: Sequence[int],
-        families: Sequence[str],
-        seed: int,
-        stream: int = TRAIN_STREAM,
-    ) -> None:
-        self.levels, self.families = tuple(levels), tuple(families)
-        self.seed, self.stream = seed, stream
-        for family in self.families:
-            check_family(family)
-        if not all(level in range(OOD_LEVELS[-1] + 1) for level in self.levels):
-            raise ValueError(
-                f"levels must be whole numbers from 0 to {OOD_LEVELS[-1]}, got {self.levels}"
-            )
-        samples = len(self.levels) * len(self.families) * TILE_SAMPLES**2
-        if not 0 < samples <= MAX_SAMPLES:
-            raise ValueError(
-                f"a grid needs 1 to {MAX_SAMPLES // TILE_SAMPLES**2} tiles (Bullet holds "
-                f"{MAX_SAMPLES} samples), got {len(self.levels)} x {len(self.families)}"
-            )
-        super().__init__((len(self.levels), len(self.families)))
-
-    @classmethod
-    def build(
-        cls,
-        levels: Sequence[int],
-        families: Sequence[str],
-        seed: int,
-        stream: int = TRAIN_STREAM,
-        index: ArrayLike = 0,
-    ) -> TerrainGrid:
-        """Make a grid and draw its tiles; `index` as in `redraw`."""
-        grid = cls(levels, families, seed, stream)
-        grid.redraw(index)
-        return grid
-
-    def redraw(self, index: ArrayLike) -> None:
-        """Replace every tile, in place, by number `index` of its kind (see `tile_rng`).
-
-        `index` is one number for all tiles or an array that broadcasts to (rows, cols), which
-        tells rows of the same level, or columns of the same family, apart.
-        """
-        indices = np.broadcast_to(np.asarray(index), self.shape)
-        for row, level in enumerate(self.levels):
-            for col, family in enumerate(self.families):
-                rng = tile_rng(self.seed, family, level, indices[row, col], self.stream)
-                self.place(row, col, make_tile(family, level / MAX_LEVEL, rng))
 
 
 def interpolate(surface: HeightArray, cell: float, x: ArrayLike, y: ArrayLike) -> FloatArray:

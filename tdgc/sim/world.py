@@ -3,8 +3,6 @@
 Robots pass through each other (a collision mask). Arrays have a leading axis of M robots.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import functools
@@ -420,11 +418,7 @@ class World:
             torque = pd_torque(target - q, qd, strength, self.robot, friction)
             for body, forces in zip(bodies, torque.tolist(), strict=True):
                 command(
-                    body,
-                    joints,
-                    pybullet.TORQUE_CONTROL,
-                    forces=forces,
-                    physicsClientId=client.id,
+                    body, joints, pybullet.TORQUE_CONTROL, forces=forces, physicsClientId=client.id
                 )
             started = time.perf_counter()
             client.stepSimulation()
@@ -569,11 +563,7 @@ class Stage(World):
     """
 
     def __init__(
-        self,
-        robot: RobotConfig,
-        physics: PhysicsConfig,
-        field: TileField,
-        window: bool = False,
+        self, robot: RobotConfig, physics: PhysicsConfig, field: TileField, window: bool = False
     ) -> None:
         if window:
             check_display()

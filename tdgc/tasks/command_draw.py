@@ -1,17 +1,16 @@
 """Commands drawn in training, and the curriculum that widens the velocity ranges of each gait."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import LowLevelConfig
-from tdgc.sim.commands import CONTINUOUS, INDEX
+from tdgc.sim.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.robot import Array
 
+_FALLS = 256  # of a task's robots, the last ones: a few minutes of walking
 # Of ``low_statistics.by_gait``, what a gait is judged by: samples, and sums over them.
 _JUDGED = ("steps", "track_lin_vel", "track_yaw_rate", "match")
 PRONK = GAITS.index("pronk")
@@ -30,6 +29,8 @@ class CommandDraw:
         share: (4,) share of the velocity ranges that each gait uses.
         scores: (4, 4) sums for each gait since it was last judged: samples, what tracking of
             velocity and of yaw rate earned, and shares of feet in contact as desired.
+        falls: (256, 13) gait and continuous commands that robots fell at, the last one first; gait
+            -1 where there were none yet.
     """
 
     def __init__(self, config: LowLevelConfig, rng: np.random.Generator, training: bool) -> None:
@@ -38,6 +39,7 @@ class CommandDraw:
         self._low, self._high = np.array(bounds).T
         self.share = np.full(len(GAITS), config.command_start if training else 1.0)
         self.scores = np.zeros((len(GAITS), 4))
+        self.falls = np.full((_FALLS, 1 + len(CONTINUOUS)), -1.0)
 
     def bounds(self, n: int) -> tuple[Array, Array, Array]:
         """What n free commands are drawn from: probabilities of the gaits, (n, 4), and lower and
@@ -50,9 +52,9 @@ class CommandDraw:
 
     def draw(
         self, gaits: Array, low: Array, high: Array, free: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int64], Array]:
-        """Gaits (n,) and continuous commands (n, 12) from such ``bounds``; of the ``free`` ones
-        (n,) some leap."""
+    ) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+        """Gaits (n,) and continuous commands (n, 12) from such ``bounds``, and which of them (n,)
+        are tried again; of the ``free`` ones (n,) some leap, and some are what robots fell at."""
         n, rng, config = len(free), self._rng, self._config.command_draw
         gait = np.sum(rng.uniform(size=(n, 1)) > np.cumsum(gaits, axis=1)[:, :-1], axis=1)
         values = rng.uniform(low, high)
@@ -63,7 +65,16 @@ class CommandDraw:
             values[leap, j] = low[leap, j] + share * (high - low)[leap, j]
         values[:, :3] *= self.share[gait][:, None]
         values[rng.uniform(size=n) < config.standing, :3] = 0.0
-        return gait, values
+        again = free & (rng.uniform(size=n) < config.retries)
+        rows = self.falls[rng.integers(0, _FALLS, n)]
+        again &= rows[:, 0] >= 0.0
+        gait[again], values[again] = rows[again, 0].astype(np.int64), rows[again, 1:]
+        return gait, values, again
+
+    def remember(self, command: Array) -> None:
+        """Commands (n, 15) that robots have just fallen at."""
+        fallen = np.column_stack([gait_index(command), command[:, : len(CONTINUOUS)]])
+        self.falls = np.concatenate([fallen, self.falls])[:_FALLS]
 
     def judge(self, sums: Mapping[str, Array], num_robots: int) -> None:
         """Add the sums of a step of M robots, as ``by_gait`` has them; widen the velocity ranges of

@@ -4,8 +4,6 @@ A robot that crosses is steered from platform to platform along a waypoint, faci
 any other way; its pitch follows the slope, and over trenches most leap. Levels rise with crossings.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,7 +17,7 @@ from tdgc.sim.terrain import MAX_LEVEL, TILE_SIZE, TileField
 from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import Ground
-from tdgc.tasks.leaps import SWING_HEIGHT, Landing, LeapPlan
+from tdgc.tasks.leaps import DURATION, SWING_HEIGHT, Landing, LeapPlan, Motion
 from tdgc.tasks.rules import GOAL_RADIUS
 from tdgc.tasks.tiles import FLAT
 
@@ -98,18 +96,21 @@ class Crossings:
         low[:, bend] *= (1.0 - (1.0 - c.bend) * d)[:, None]
         high[:, bend] *= (1.0 - (1.0 - c.bend) * d)[:, None]
 
-    def draw(self, index: NDArray[np.integer], gait: Ints, values: Array) -> None:
+    def draw(self, index: NDArray[np.integer], gait: Ints, values: Array, grown: float) -> None:
         """Draw how the robots ``index`` (n,) cross with the gaits (n,) and continuous commands
-        (n, 12) drawn for them; the swing height of leaps is changed in place."""
+        (n, 12) drawn for them; swing height and duty factor of leaps are changed in place. Leaps
+        are ``grown`` times as fast as they will be: the share of the velocity ranges that pronk
+        has come to."""
         n, rng, c, e = len(index), self._rng, self._config, self._episodes
         leaps = e.crossing[index] & self.leapers[index] & (gait == PRONK)
         swing = INDEX["swing_height"]
         values[leaps, swing] = rng.uniform(self._low[swing], SWING_HEIGHT, int(leaps.sum()))
+        values[leaps, INDEX["duration"]] = DURATION  # which landings are planned for
         e.leaping[index] = leaps
         e.follow[index] = np.where(leaps, 0.0, rng.uniform(size=n))
         e.pitch[index] = values[:, _PITCH]
         slow, fast = rng.uniform(*c.speed, n), rng.uniform(*c.leap_speed, n)
-        e.speed[index] = np.where(leaps, fast, slow)
+        e.speed[index] = np.where(leaps, grown * fast, slow)
         anywhere = rng.uniform(-np.pi, np.pi, n)
         ahead = leaps | (rng.uniform(size=n) < c.facing)
         e.facing[index] = np.where(ahead, 0.0, anywhere)
@@ -142,13 +143,13 @@ class Crossings:
         e, state = self._episodes, loco.world.state
         rows = np.flatnonzero(e.leaping & (e.elapsed % self._config.leap_decimation == 0))
         if rows.size:
-            frequency, length = self._plan.steps(
-                rows,
+            motion = Motion(
                 (state.position[:, 0] - e.origin[:, 0])[rows],
                 state.heading_vel[rows, 0],
+                e.speed[rows],
                 loco.clock.clock[rows],
-                self.landing,
             )
+            frequency, length = self._plan.steps(rows, motion, self.landing)
             loco.command[rows, _FREQUENCY], loco.command[rows, _LENGTH] = frequency, length
 
     def learn_landing(self, loco: Locomotion, clock: Array) -> None:

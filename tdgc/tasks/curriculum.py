@@ -16,8 +16,6 @@ that has held its level: the text's reacts within an episode, Algorithm 1's with
 (or bottom) level a further promotion (or demotion) is no change, so that window slides too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What M robots carry from step to step of their episodes in the low policy's MDP."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -10,16 +8,24 @@ from numpy.typing import NDArray
 
 class Episodes:
     """Arrays with a row per robot, all zero where an episode begins; checkpoints hold them by
-    name."""
+    name.
 
-    def __init__(self, num_robots: int) -> None:
+    Args:
+        num_robots: M.
+        memory: control steps that tilts are remembered for.
+    """
+
+    def __init__(self, num_robots: int, memory: int) -> None:
         m = num_robots
         self.elapsed = np.zeros(m, dtype=np.int64)  # control steps
         self.began = np.zeros(m, dtype=np.int64)  # ``elapsed`` at the first step
         self.next_push = np.zeros(m, dtype=np.int64)  # ``elapsed`` at the next push
         self.was_contact = np.zeros((m, 4), dtype=bool)  # of the feet, at the last step
+        # x and y of gravity in the trunk's frame, newest first; before an episode it stood upright.
+        self.tilts = np.zeros((m, memory, 2))
         self.origin = np.zeros((m, 2))  # m in the world, corner of the tile
         self.crossing = np.zeros(m, dtype=bool)  # the others have free commands
+        self.retried = np.zeros(m, dtype=bool)  # those that another robot fell at
         # Of a crossing:
         self.waypoint = np.zeros((m, 2))  # m in the world
         self.reached = np.zeros(m, dtype=bool)

@@ -1,7 +1,5 @@
 """The executor: the lower half of the paper's closed loop, commands -> joint targets -> physics."""
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 import numpy as np

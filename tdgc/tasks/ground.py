@@ -1,7 +1,5 @@
 """The ground under M robots, as the low policy's rewards, critic and crossings see it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

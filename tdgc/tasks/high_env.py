@@ -4,8 +4,6 @@
 curriculum sets; ``NavigationEnv`` is its Gymnasium face for one.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from pathlib import Path
@@ -44,14 +42,8 @@ from tdgc.state import State, copies, fill
 from tdgc.tasks import rewards
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.leaps import Landing
-from tdgc.tasks.probes import (
-    NUM_PROBES,
-    PROBE_RANGE,
-    PROBE_SWAP,
-    PROBES,
-    HeightProbes,
-)
+from tdgc.tasks.leaps import FREQUENCIES, Landing
+from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP, PROBES, HeightProbes
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, has_failed, outcome
 from tdgc.tasks.task_env import TaskEnv
@@ -62,14 +54,26 @@ from tdgc.tasks.tiles import TrainingTiles, shallow
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
 
 GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
-_GUIDANCE = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
+#: Width of what a teacher adds to an observation.
+GUIDANCE = NUM_ACTIONS + FREQUENCIES
+_LED = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
 
 #: The semantic cue: one-hot over the families, and one place for "unknown".
 SEMANTIC = (*FAMILIES, "unknown")
 
 
-class _Seen(NamedTuple):
-    """What o^H is read from, see ``observe_high``."""
+class Seen(NamedTuple):
+    """What o^H of M robots is read from.
+
+    Attributes:
+        loco: the robots.
+        goal: (M, 2) m in the world.
+        time_share: (M,) t / T_max.
+        last_action: (M, 13), normalised.
+        families: (M,) index into ``SEMANTIC``.
+        probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
+        late: (M,) how many decisions ago those were measured.
+    """
 
     loco: Locomotion
     goal: Array
@@ -77,9 +81,10 @@ class _Seen(NamedTuple):
     last_action: Array
     families: NDArray[np.int64]
     probes: Array
+    late: NDArray[Any]
 
 
-def _goal(seen: _Seen) -> Array:
+def _goal(seen: Seen) -> Array:
     state = seen.loco.world.state
     offset = seen.goal - state.position[:, :2]
     bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
@@ -87,12 +92,12 @@ def _goal(seen: _Seen) -> Array:
     return np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1)
 
 
-def _joint_error(seen: _Seen) -> Array:
+def _joint_error(seen: Seen) -> Array:
     return seen.loco.world.state.q - seen.loco.joint_offset - seen.loco.nominal
 
 
 _FLIP_ACTION = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in (*CONTINUOUS, "gait")))
-_LAYOUT: tuple[Term[_Seen], ...] = (
+_LAYOUT: tuple[Term[Seen], ...] = (
     Term("goal", 3, _goal, mirror=in_place(1.0, 1.0, -1.0)),
     Term("time_left", 1, lambda s: 1.0 - s.time_share[:, None]),
     Term("gravity", 3, lambda s: s.loco.world.state.gravity, mirror=ARROW),
@@ -101,23 +106,28 @@ _LAYOUT: tuple[Term[_Seen], ...] = (
     Term("last_action", 13, lambda s: s.last_action, mirror=_FLIP_ACTION),
     Term("clock", 4, lambda s: s.loco.clock.signal(), mirror=LEGS),
 )
+_COSINE: Term[Seen] = Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), mirror=LEGS)
 _PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
-_CUES: dict[str, Term[_Seen]] = {
+_AGE: Term[Seen] = Term("probe_age", 1, lambda s: s.late[:, None].astype(np.float64))
+_CUES: dict[str, Term[Seen]] = {
     "semantic": Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
     "geometric": Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
 }
 
 
-def high_layout(cues: str) -> tuple[Term[_Seen], ...]:
+def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
     """The terms of the high policy's observation o^H, in order."""
-    return _LAYOUT + tuple(term for cue, term in _CUES.items() if cues in ("both", cue))
+    clock = (_COSINE,) if config.clock == "both" else ()
+    cues = [term for cue, term in _CUES.items() if config.cues in ("both", cue)]
+    age = (_AGE,) if config.probe_age and config.cues in ("both", "geometric") else ()
+    return (*_LAYOUT, *clock, *cues, *age)
 
 
 def high_spaces(
     config: HighLevelConfig, guided: bool = False
 ) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """Observations, with the teacher's actions where it guides, and actions of the high policy."""
-    size = width(high_layout(config.cues)) + guided * NUM_ACTIONS
+    """Observations, with the teacher's guidance if there is one, and actions of the high policy."""
+    size = width(high_layout(config)) + guided * GUIDANCE
     limit = config.action_limit
     seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
     return seen, gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
@@ -141,31 +151,7 @@ def high_mirror(config: HighLevelConfig) -> Mirror:
                 f"commands.{name} must be the same to both sides for a symmetric policy, not "
                 f"{[low, high]}; ppo.mirror=false does without symmetry"
             )
-    return Mirror(*mirror(high_layout(config.cues)), *_FLIP_ACTION)
-
-
-def observe_high(
-    loco: Locomotion,
-    goal: Array,
-    time_share: Array,
-    last_action: Array,
-    families: NDArray[np.int64],
-    cues: str,
-    probes: Array,
-) -> NDArray[np.float32]:
-    """o^H of M robots, (M, n), of ``high_layout``.
-
-    Args:
-        loco: the robots.
-        goal: (M, 2) m in the world.
-        time_share: (M,) t / T_max.
-        last_action: (M, 13), normalised.
-        families: (M,) index into ``SEMANTIC``.
-        cues: both, semantic, geometric or none.
-        probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
-    """
-    seen = _Seen(loco, goal, time_share, last_action, families, probes)
-    return observe(high_layout(cues), seen)
+    return Mirror(*mirror(high_layout(config)), *_FLIP_ACTION)
 
 
 def command_share(commands: Array, decoder: CommandDecoder) -> Array:
@@ -276,8 +262,9 @@ class NavigationTask:
         training: draw disturbances and let the curriculum move levels.
         visual: keep what pictures of the ground need.
         guided: decisions of each robot in which a teacher helps, see ``tdgc.learn.imitation``. Its
-            actions follow the observation, and it drives a share of the episodes that falls from
-            all to none over the first ``_GUIDANCE`` of these decisions.
+            guidance follows the observation: its actions, and the prices of step frequencies from
+            the least to the greatest action, see ``Teacher.price``. It drives a share of the
+            episodes that falls from all to none over the first ``_LED`` of these decisions.
         landing: of the low policy, for the teacher.
     """
 
@@ -324,7 +311,7 @@ class NavigationTask:
         self._commands = np.zeros((3, m, 15))
         self.stats: dict[str, float] = {}
         families = [config.families[f] for f in self.family]
-        ranges = self.low_config.commands
+        ranges = config.commands or CommandRanges()
         self.teacher = Teacher(self.field, families, ranges, landing) if guided else None
         self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
@@ -366,7 +353,7 @@ class NavigationTask:
         self._probes.begin(index)
         if self.teacher is not None:
             self.teacher.begin(index, self.goal)
-            share = 1.0 - self._decisions[0] / (_GUIDANCE * self._guided)
+            share = 1.0 - self._decisions[0] / (_LED * self._guided)
             self._led[index] = rng.uniform(size=n) < share
 
     def _width(self) -> Array:
@@ -409,6 +396,8 @@ class NavigationTask:
             now = np.column_stack([state.trunk_force, state.leg_force])
             np.maximum(force, now, out=force)
         self._probes.measure()
+        if self.teacher is not None:
+            self.teacher.watch(loco, self.step_seconds)
         self.elapsed += 1
         self._reached_at[reached & (self._reached_at < 0)] = self.elapsed[
             reached & (self._reached_at < 0)
@@ -436,21 +425,25 @@ class NavigationTask:
         return reward, failed, truncated
 
     def observe(self) -> NDArray[np.float32]:
-        """o^H, (M, n), and with a teacher its actions, (M, 13)."""
-        seen = observe_high(
-            self.locomotion,
-            self.goal,
-            self.elapsed / self.horizon,
-            self._actions[0],
-            self.family_index,
-            self.config.cues,
-            self._probes.read(),
+        """o^H, (M, n), and with a teacher its guidance, (M, ``GUIDANCE``)."""
+        seen = observe(
+            high_layout(self.config),
+            Seen(
+                self.locomotion,
+                self.goal,
+                self.elapsed / self.horizon,
+                self._actions[0],
+                self.family_index,
+                self._probes.read(),
+                self._probes.late,
+            ),
         )
         if self.teacher is None:
             return seen
         commands = self.teacher.commands(self.locomotion, self.goal)
         self._taught = self.decoder.encode(self.decoder.nearest(commands))
-        return np.concatenate([seen, self._taught], axis=1, dtype=np.float32)
+        parts = (seen, self._taught, self.teacher.price)
+        return np.concatenate(parts, axis=1, dtype=np.float32)
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -510,7 +503,8 @@ class NavigationTask:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """Of the episodes under way."""
-        return {
+        taught = {} if self.teacher is None else {"speed": self.teacher.speed}
+        return taught | {
             "goal": self.goal,
             "elapsed": self.elapsed,
             "reached_at": self._reached_at,
@@ -558,6 +552,7 @@ class NavigationTask:
         self.locomotion.load_state_dict(episodes["locomotion"])
         if self.teacher is not None:
             self.teacher.begin(np.arange(self.num_robots), self.goal)
+            self.teacher.speed[:] = episodes["speed"]
 
     def close(self) -> None:
         """Disconnect from Bullet."""

@@ -1,17 +1,15 @@
 """Leaps over trenches: pronk whose landings are planned to miss them.
 
 In pronk the front feet land on one line and the rear feet on another, and a robot that steers
-straight on decides where by its step frequency and its stance length alone. So a trench is crossed
-by a plan of landings: a value function over the place of the front feet, found by dynamic
-programming over the strides to come, says what each place is worth, and the frequency is chosen
-for the best place within reach. Where the feet of a low policy land against its trunk is its own,
-to a few centimetres, so that is measured.
+straight on decides where by its speed, its step frequency and its stance length. So a trench is
+crossed by a plan of landings: a value function over the place of the front feet, found by dynamic
+programming over the strides to come, says what each place is worth, and frequency and stance length
+are chosen for the best place within reach. Feet land about where Raibert's rule has them; by how
+much a low policy misses that is its own, to a few centimetres, so it is measured.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,31 +24,55 @@ from tdgc.sim.terrain import TILE_SIZE
 if TYPE_CHECKING:  # the low policy's workers do without PyTorch
     from tdgc.policies import Policy
 
-#: How leaps are made: m/s, m of swing. Of feet at 5 cm a quarter fell in. At the 2 Hz of a start
-#: from rest robots were thrown down, so a slow one is timed as if it had this speed already
-#: (docs/experiments.md).
-SPEED, SWING_HEIGHT = 1.0, 0.07
+#: How leaps are made: m/s, m of swing, duty factor. The faster, the longer a stride and the wider
+#: the trenches that fit in: of 24 robots 5, 10 and 17 crossed level 10 at 1.0, 1.1 and 1.2 m/s. Of
+#: feet at 5 cm a quarter fell in. At the 2 Hz of a start from rest robots were thrown down, so a
+#: stride of a slow one is priced as if it had this speed already (docs/experiments.md).
+SPEED, SWING_HEIGHT, DURATION = 1.2, 0.07, 0.5
 STRIDE = 0.39  # m, of leaps where nothing asks for another: longer ones trip at the start
+BEYOND = 0.5  # m behind the last trench, where leaping ends
+_TURN = 1.5  # 1/s, yaw rate per rad that a leap is off its heading; as in ``teacher.toward``
 _STEP = 0.01  # m between the places of a plan
-_STRIDES = np.arange(28, 49, 2)  # steps: what 1 m/s reaches between 2 and 3.6 Hz
+_STRIDES = np.arange(28, 55, 2)  # steps: what SPEED reaches between 2.1 and 4 Hz
 _CLEAR = 0.08  # m from a lip, at which a foot is as good as anywhere
 _FALL = 4.0  # price of a foot in a trench; one that lands on the lip costs 1
 _STRIDE_PRICE = 10.0  # 1/m^2, of a stride that is not STRIDE
 _LENGTH_PRICE = 10.0  # 1/m^2, of rear feet that do not land where the front feet stood
-_FREQUENCIES = 25  # that are tried at each decision
+FREQUENCIES = 25  # that are tried at each decision, evenly over the range of the command
+# How robots speed up, of two low policies: 0.8, 1.1 and 1.2 m/s at the first landings after a rest,
+# and 1.14 m/s for 1.2 in the long run. Without it a trench right behind the start was misjudged by
+# 7 cm.
+_RISE, _REACHED = 0.3, 0.95  # s of the exponential; share of the commanded speed at its end
+# What is about as good as the best choice: the price by which others count e times less, and how
+# many Hz and m they may be away, so that leaping short is never mixed with leaping far.
+_TEMPERATURE, _NEAR = 0.05, (0.35, 0.03)
+
+
+def lead(speed: Array, frequency: Array) -> Array:
+    """How far ahead of their places at rest feet touch down, m: half of what the trunk travels in a
+    stance (Raibert), at ``speed`` in m/s and ``frequency`` in Hz."""
+    return 0.5 * DURATION * speed / frequency
+
+
+def speed_up(speed: Array, commanded: Array | float, time: Array | float) -> tuple[Array, Array]:
+    """How far a trunk gets in ``time`` s, in m, and how fast it is then, in m/s: from ``speed``
+    towards nearly the ``commanded`` one. It does not slow down."""
+    top = np.maximum(speed, _REACHED * commanded)
+    left = np.exp(-time / _RISE)
+    return top * time - (top - speed) * _RISE * (1.0 - left), top - (top - speed) * left
 
 
 @dataclass
 class Landing:
-    """Where a low policy lands in pronk, in m.
+    """By how much a low policy's feet miss Raibert's footholds when they land in pronk, in m.
 
     Attributes:
-        front: its front feet, ahead of the trunk as it is at clock 0.
+        front: its front feet, ahead of their footholds.
         spread: its rear feet, so much further behind the front ones than commanded.
     """
 
-    #: Of the first edition's low policy; a measurement replaces it.
-    front: float = 0.20
+    #: Until something is known.
+    front: float = 0.0
     spread: float = 0.0
 
     def learn(
@@ -71,14 +93,14 @@ class Landing:
         seen = rows[landed]
         if seen.size:
             feet = state.foot_position[seen, :, 0]
-            command = loco.executed()[seen]
-            since = clock[landed] / command[:, INDEX["frequency"]]
-            trunk = state.position[seen, 0] - since * state.lin_vel[seen, 0]
+            command, speed = loco.executed()[seen], state.lin_vel[seen, 0]
+            frequency, length = command[:, INDEX["frequency"]], command[:, INDEX["stance_length"]]
+            trunk = state.position[seen, 0] - clock[landed] / frequency * speed
             front, rear = feet[:, :2].mean(axis=1), feet[:, 2:].mean(axis=1)
+            foothold = trunk + 0.5 * length + lead(speed, frequency)
             weight = 1.0 - (1.0 - rate) ** seen.size
-            self.front += weight * float(np.mean(front - trunk) - self.front)
-            spread = front - rear - command[:, INDEX["stance_length"]]
-            self.spread += weight * float(np.mean(spread) - self.spread)
+            self.front += weight * float(np.mean(front - foothold) - self.front)
+            self.spread += weight * float(np.mean(front - rear - length) - self.spread)
 
 
 def foothold_risk(x: NDArray[np.floating], trenches: Array) -> Array:
@@ -90,6 +112,38 @@ def foothold_risk(x: NDArray[np.floating], trenches: Array) -> Array:
     return np.where(inside > 0.0, _FALL, near)
 
 
+class Motion(NamedTuple):
+    """Of n robots that leap, (n,) each.
+
+    Attributes:
+        x: m, of the trunk along the trenches.
+        speed, commanded: m/s forward.
+        clock: of the gait, 0 where feet touch down.
+    """
+
+    x: Array
+    speed: Array
+    commanded: Array
+    clock: Array
+
+
+class Lesson(NamedTuple):
+    """How n robots should make their next stride, to be imitated.
+
+    Of the choices about as good as the best one jumps about, for no reason that a student could
+    see, so these are their means. But between two ways of crossing a trench lies its middle, and
+    who is in doubt between them and takes a mean steps there; so it is told the prices, too.
+
+    Attributes:
+        frequency, length: (n,) Hz and m, of steps and stance.
+        price: (n, FREQUENCIES) what each frequency costs more than the best one does.
+    """
+
+    frequency: Array
+    length: Array
+    price: Array
+
+
 class LeapPlan:
     """What landings are worth, for M robots that each leap along trenches of their own.
 
@@ -99,64 +153,105 @@ class LeapPlan:
     """
 
     def __init__(self, num_robots: int, ranges: CommandRanges) -> None:
-        self._ranges = ranges
         low, high = ranges.stance_length
+        self._speed = min(SPEED, ranges.vx[1])
         self._lengths = np.linspace(low, high, 1 + round((high - low) / _STEP))
-        self._frequencies = np.linspace(*ranges.frequency, _FREQUENCIES)
-        n = 1 + round(TILE_SIZE / _STEP)
-        self._x = _STEP * np.arange(n)
-        # Price of landing at each place, of all that follows, and the stance length to land with.
-        self._price = np.zeros((num_robots, n))
-        self._value = np.zeros((num_robots, n))
-        self._length = np.full((num_robots, n), min(max(STRIDE, low), high))
+        self._frequencies = np.linspace(*ranges.frequency, FREQUENCIES)
+        self._x = _STEP * np.arange(1 + round(TILE_SIZE / _STEP))
+        # Price of front feet at each place, with each stance length, and of all that follows.
+        self._cost = np.zeros((num_robots, len(self._x), len(self._lengths)))
 
     def look(self, robot: int, trenches: ArrayLike, spread: float) -> None:
         """Plan for one robot along ``trenches`` (k, 2) m, the x of their lips, in its own frame."""
         lips = np.asarray(trenches, dtype=np.float64).reshape(-1, 2)
         x, n = self._x, len(self._x)
-        rear = foothold_risk(x[:, None] - self._lengths - spread, lips)
-        rear += _LENGTH_PRICE * (self._lengths + spread - STRIDE) ** 2
-        best = rear.argmin(axis=1)
-        price = foothold_risk(x, lips) + rear[np.arange(n), best]
+        price = foothold_risk(x[:, None] - self._lengths - spread, lips)
+        price += _LENGTH_PRICE * (self._lengths + spread - STRIDE) ** 2
+        price += foothold_risk(x, lips)[:, None]
         value = np.zeros(n + _STRIDES[-1])
-        after = np.concatenate([price, np.zeros(_STRIDES[-1])])
+        after = np.concatenate([price.min(axis=1), np.zeros(_STRIDES[-1])])
         dear = _STRIDE_PRICE * (_STEP * _STRIDES - STRIDE) ** 2
         end = lips[-1, 1] + STRIDE if len(lips) else 0.0  # nothing is worth planning behind it
         for k in range(min(n, round(end / _STEP)) - 1, -1, -1):
             ahead = k + _STRIDES
             value[k] = np.min(dear + after[ahead] + value[ahead])
-        self._price[robot], self._value[robot] = price, value[:n]
-        self._length[robot] = self._lengths[best]
+        self._cost[robot] = price + value[:n, None]
 
     def steps(
-        self, rows: NDArray[np.integer], x: Array, speed: Array, clock: Array, landing: Landing
+        self, rows: NDArray[np.integer], motion: Motion, landing: Landing
     ) -> tuple[Array, Array]:
         """Step frequency in Hz and stance length in m for the next landing, (n,) each.
 
         Args:
             rows: (n,) of the M robots.
-            x, speed, clock: (n,) m of the trunk, m/s forward, and of the gait, 0 where feet touch
-                down.
+            motion: theirs.
             landing: the low policy's.
         """
-        fast = np.maximum(speed, SPEED)[:, None]
-        stride = fast / self._frequencies
-        # What the trunk still travels to the landing: at its own speed, not the one hoped for.
-        to_go = (1.0 - clock)[:, None] / self._frequencies * np.maximum(speed, 0.0)[:, None]
-        place = np.round((x[:, None] + landing.front + to_go) / _STEP).astype(int)
+        cost = self._costs(rows, motion, landing)
+        frequency, length = self._best(cost)
+        return self._frequencies[frequency], self._lengths[length]
+
+    def lesson(self, rows: NDArray[np.integer], motion: Motion, landing: Landing) -> "Lesson":
+        """As ``steps``, for who is to be imitated, and what other frequencies would cost."""
+        cost = self._costs(rows, motion, landing)
+        frequency, length = self._best(cost)
+        off = np.abs(self._frequencies - self._frequencies[frequency][:, None])
+        near = (off < _NEAR[0])[:, :, None]
+        off = np.abs(self._lengths - self._lengths[length][:, None])
+        alike = (off < _NEAR[1] + 1e-9)[:, None, :]
+        weight = near * alike * np.exp((cost.min(axis=(1, 2), keepdims=True) - cost) / _TEMPERATURE)
+        weight /= weight.sum(axis=(1, 2), keepdims=True)
+        price = np.where(alike, cost, np.inf).min(axis=2)
+        return Lesson(
+            weight.sum(axis=2) @ self._frequencies,
+            weight.sum(axis=1) @ self._lengths,
+            price - price.min(axis=1, keepdims=True),
+        )
+
+    def _best(self, cost: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        best = cost.reshape(len(cost), -1).argmin(axis=1)
+        frequency, length = np.divmod(best, len(self._lengths))
+        return frequency, length
+
+    def _costs(self, rows: NDArray[np.integer], motion: Motion, landing: Landing) -> Array:
+        """Of each frequency and stance length, (n, frequencies, lengths)."""
+        stride = np.maximum(motion.speed, self._speed)[:, None] / self._frequencies
+        left = (1.0 - motion.clock)[:, None] / self._frequencies
+        own = np.maximum(motion.speed, 0.0)[:, None]
+        way, then = speed_up(own, motion.commanded[:, None], left)
+        foothold = motion.x[:, None] + way + lead(then, self._frequencies) + landing.front
+        place = np.round((foothold[:, :, None] + 0.5 * self._lengths) / _STEP).astype(int)
         place = np.clip(place, 0, len(self._x) - 1)
-        cost = self._price[rows[:, None], place] + self._value[rows[:, None], place]
-        best = (cost + _STRIDE_PRICE * (stride - STRIDE) ** 2).argmin(axis=1)
-        chosen = place[np.arange(len(rows)), best]
-        return self._frequencies[best], self._length[rows, chosen]
+        cost = self._cost[rows[:, None, None], place, np.arange(len(self._lengths))]
+        return np.asarray(cost + (_STRIDE_PRICE * (stride - STRIDE) ** 2)[:, :, None])
 
 
 def leap_command(command: Array, frequency: ArrayLike, length: ArrayLike) -> None:
     """Turn commands (n, 15) into those of a leap, in place: gait, swing, frequency, length."""
     command[:, INDEX["swing_height"]] = SWING_HEIGHT
+    command[:, INDEX["duration"]] = DURATION
     command[:, INDEX["frequency"]] = frequency
     command[:, INDEX["stance_length"]] = length
     command[:, 12:] = gait_embedding(GAITS.index("pronk"))
+
+
+def steer_leap(command: Array, bearing: Array, heading: Array, ranges: CommandRanges) -> None:
+    """Set the velocities of commands (n, 15) of leaps, in place.
+
+    The robots face across the trenches, so that both feet of a pair land on one line, and go
+    sideways to the goal.
+
+    Args:
+        command: to be changed.
+        bearing, heading: (n,) rad of the goal and of the robots, against across the trenches.
+        ranges: that they stay within.
+    """
+    wanted = (
+        ("vx", SPEED * np.cos(bearing)), ("vy", SPEED * np.sin(bearing)),
+        ("yaw_rate", -_TURN * heading),
+    )  # fmt: skip
+    for name, value in wanted:
+        command[:, INDEX[name]] = np.clip(value, *getattr(ranges, name))
 
 
 _ROBOTS = 16  # that a landing is measured with: a few millimetres between two such measurements
@@ -165,8 +260,8 @@ _STANDING = 0.5  # share of the robots that are still up after the measurement, 
 _RATE = 0.02  # of a landing in the measurement: after 180 of them 3 % of the start is left
 
 
-def measure_landing(low: Policy, config: LowLevelConfig) -> Landing | None:
-    """Where ``low`` lands when it leaps along a plane, with strides of 0.30 to 0.46 m.
+def measure_landing(low: "Policy", config: LowLevelConfig) -> Landing | None:
+    """Where ``low`` lands when it leaps along a plane, with strides of 0.32 to 0.50 m.
 
     Args:
         low: the low policy, of ``config``.
@@ -176,10 +271,10 @@ def measure_landing(low: Policy, config: LowLevelConfig) -> Landing | None:
     """
     loco = Locomotion(_ROBOTS, config.robot, config.physics, None, config.gyro)
     rows, dt = np.arange(_ROBOTS), config.physics.control_dt
-    stride = np.linspace(0.30, 0.46, _ROBOTS)
-    loco.command[:, INDEX["vx"]] = min(SPEED, config.commands.vx[1])
+    stride = np.linspace(0.32, 0.50, _ROBOTS)
+    loco.command[:, INDEX["vx"]] = speed = min(SPEED, config.commands.vx[1])
     length = np.clip(stride, *config.commands.stance_length)
-    leap_command(loco.command, np.clip(SPEED / stride, *config.commands.frequency), length)
+    leap_command(loco.command, np.clip(speed / stride, *config.commands.frequency), length)
     places = np.column_stack([np.zeros(_ROBOTS), 2.0 * rows])
     loco.place(rows, places, np.zeros(_ROBOTS), np.linspace(0.0, 1.0, _ROBOTS, endpoint=False))
     landing, up = Landing(), rows

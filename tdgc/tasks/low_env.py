@@ -3,9 +3,8 @@
 ``LowLevelTask`` is the MDP for M robots at once; ``LowLevelEnv`` is its Gymnasium face for one.
 """
 
-from __future__ import annotations
-
 import functools
+import math
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from tdgc.config import LowLevelConfig
 from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.worker import Task
-from tdgc.sim.commands import gait_index
+from tdgc.sim.commands import INDEX, gait_index
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import observe
@@ -23,7 +22,7 @@ from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, draw_start_goal
 from tdgc.state import State, copies, fill
 from tdgc.tasks import rewards
-from tdgc.tasks.command_draw import CommandDraw
+from tdgc.tasks.command_draw import PRONK, CommandDraw
 from tdgc.tasks.crossings import Crossings
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import measure_ground
@@ -82,7 +81,9 @@ class LowLevelTask:
         alter = functools.partial(shallow, shallowest=config.crossing.shallowest_trench)
         self.tiles = TrainingTiles(families, seed, alter) if on_tiles else None
         self.field = None if self.tiles is None else self.tiles.field
-        self.episodes = Episodes(m)
+        # The control steps of the slowest gait's cycle, and one between which and the next it ends.
+        cycle = 1.0 / (config.commands.frequency[0] * config.physics.control_dt)
+        self.episodes = Episodes(m, math.ceil(cycle) + 1)
         self.commands = CommandDraw(config, self.rng, training)
         self.crossings = Crossings(config, families, self.episodes, self.rng)
         self.pushes = Pushes(
@@ -142,8 +143,10 @@ class LowLevelTask:
         """New commands for the robots ``index`` (n,), free or to cross their tiles with."""
         bounds = self.commands.bounds(len(index))
         self.crossings.narrow(index, self.level, *bounds)
-        gait, values = self.commands.draw(*bounds, ~self.episodes.crossing[index])
-        self.crossings.draw(index, gait, values)
+        free = ~self.episodes.crossing[index]
+        gait, values, again = self.commands.draw(*bounds, free)
+        self.episodes.retried[index] = again
+        self.crossings.draw(index, gait, values, self.commands.share[PRONK])
         command = np.concatenate([values, gait_embedding(gait)], axis=1)
         self.locomotion.command[index] = command
 
@@ -174,8 +177,12 @@ class LowLevelTask:
         terminated = is_fallen(loco.world)
         truncated = ~terminated & ((e.elapsed >= self.horizon) | self._left_tile() | e.reached)
         self._count(terms, reward, terminated)
+        e.tilts[:] = np.roll(e.tilts, 1, axis=1)
+        e.tilts[:, 0] = loco.world.state.gravity[:, :2]
         e.was_contact[:] = loco.world.state.foot_force > rewards.CONTACT_FORCE
         if self.training:
+            # Once each: tried again until they succeed, a few hopeless ones would be all there is.
+            self.commands.remember(loco.command[terminated & ~e.crossing & ~e.retried])
             self._move_levels(terminated, terminated | truncated)
         self._change_commands()
         if self.training:
@@ -212,9 +219,10 @@ class LowLevelTask:
 
     def _low_step(self, speed_before: Array) -> rewards.LowStep:
         loco, c = self.locomotion, self.config
+        command = loco.executed()
         return rewards.LowStep(
             state=loco.world.state,
-            command=loco.executed(),
+            command=command,
             phases=loco.clock.phases,
             contact=loco.clock.contact,
             swing=loco.swing(),
@@ -224,10 +232,20 @@ class LowLevelTask:
             targets=loco.targets,
             actions=loco.actions,
             acceleration=(loco.world.state.qd - speed_before) / c.physics.control_dt,
+            last_tilt=self._last_tilt(command[:, INDEX["frequency"]]),
             was_contact=self.episodes.was_contact,
             sigma_lin=c.rewards.sigma_lin,
             sigma_yaw=c.rewards.sigma_yaw,
         )
+
+    def _last_tilt(self, frequency: Array) -> Array:
+        """Tilt a cycle of ``frequency`` (M,) Hz ago, (M, 2), between the steps next to it."""
+        tilts = self.episodes.tilts
+        # ``tilts`` begins with the step before this one.
+        ago = 1.0 / (frequency * self.config.physics.control_dt) - 1.0
+        newer = np.clip(np.floor(ago).astype(int), 0, tilts.shape[1] - 2)
+        rows, older = np.arange(len(tilts)), (ago - newer)[:, None]
+        return (1.0 - older) * tilts[rows, newer] + older * tilts[rows, newer + 1]
 
     def _penalty(self) -> Array:
         """Share of the penalties that counts for each robot, (M,): it falls as the commands of its
@@ -285,7 +303,9 @@ class LowLevelTask:
         self.locomotion.world.forget()
 
     def _learned(self) -> dict[str, NDArray[Any]]:
-        return {"level": self.level, "command_share": self.commands.share}
+        return {
+            "level": self.level, "command_share": self.commands.share, "falls": self.commands.falls
+        }  # fmt: skip
 
     def _under_way(self) -> dict[str, NDArray[Any]]:
         return self.episodes.arrays() | {"gait_scores": self.commands.scores}
@@ -335,10 +355,7 @@ class LowLevelTask:
 
 
 def make_task(
-    config: tuple[LowLevelConfig, LowLevelConfig],
-    share: float,
-    robots: int,
-    seed: int,
+    config: tuple[LowLevelConfig, LowLevelConfig], share: float, robots: int, seed: int
 ) -> Task:
     """The robots of a worker: a share of them in the first MDP, the others in the second."""
     first = round(share * robots)

@@ -1,7 +1,5 @@
 """What the low policy's networks see: the actor a ``Locomotion``, the critic also its ground."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, NamedTuple
 
 import gymnasium as gym
@@ -58,14 +56,14 @@ CRITIC_LAYOUT: tuple[Term[Seen], ...] = (
 
 def low_spaces(config: LowLevelConfig) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     """Observations, [actor part | critic part], and actions of the low policy."""
-    size = width(actor_layout(config.gyro)) + width(CRITIC_LAYOUT)
+    size = width(actor_layout(config.robot, config.gyro)) + width(CRITIC_LAYOUT)
     limit = config.robot.action_limit
     seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
     return seen, gym.spaces.Box(-limit, limit, (NUM_JOINTS,), np.float32)
 
 
-def low_mirror(config: LowLevelConfig) -> Mirror:
+def low_mirror(config: LowLevelConfig) -> "Mirror":
     """Left-right mirror of the low policy's observations and actions."""
     from tdgc.policies import Mirror  # the low policy's workers do without PyTorch
 
-    return Mirror(*mirror((*actor_layout(config.gyro), *CRITIC_LAYOUT)), *JOINTS)
+    return Mirror(*mirror((*actor_layout(config.robot, config.gyro), *CRITIC_LAYOUT)), *JOINTS)

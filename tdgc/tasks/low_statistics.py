@@ -1,7 +1,5 @@
 """Sums over the control steps of the low policy's training, and the log's values made of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

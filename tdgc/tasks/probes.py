@@ -1,7 +1,5 @@
 """The geometric cue: heights of the ground around the robot, exact or as a sensor has them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,10 +10,11 @@ from tdgc.sim.sensors import Noise
 PROBE_RANGE = 0.5  # m, deeper and higher looks the same
 
 _AHEAD = [(0.1 + 0.05 * i, 0.0) for i in range(20)]
-_ASIDE = [(0.2 + 0.15 * i, side * (0.2, 0.4)[i % 2]) for i in range(6) for side in (1.0, -1.0)]
+_ASIDE = [(0.2 * i - 0.1, side * (0.2, 0.4)[i % 2]) for i in range(6) for side in (1.0, -1.0)]
 #: Where the probes are: 32 points (x ahead, y to the left) in m in the heading frame. Those of
 #: ``lines`` are the same on both sides: an edge across the way is found to 5 cm a metre ahead, and
-#: no pillar, 20 cm wide at least, slips between lines 20 cm apart as they sweep over the ground.
+#: no pillar, 20 cm wide at least, slips between lines 20 cm apart as they sweep over the ground,
+#: beside the trunk, too: who leans on one has to know where it is.
 #: ``staggered`` is how the first policies looked ahead.
 PROBES: dict[str, Array] = {
     "lines": np.array(_AHEAD + _ASIDE),
@@ -50,7 +49,8 @@ class HeightProbes:
 
     Attributes:
         measured: (2, M, 32) m, at this decision and at the one before.
-        late: (M,) which robots read a decision late.
+        late: (M,) which robots read a decision late. They are told so: a scan carries the time at
+            which it was taken.
     """
 
     def __init__(self, loco: Locomotion, points: Array, noise: Noise | None) -> None:

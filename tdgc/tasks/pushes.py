@@ -1,7 +1,5 @@
 """Random pushes in training: now and then a robot's trunk gets another horizontal velocity."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -7,8 +7,6 @@ as Walk These Ways does, so that good gait multiplies what tracking earns:
     R = dt * (sum of positive terms) * exp(sum of negative terms)
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -42,6 +40,7 @@ class LowStep:
         targets: (3, M, 12) rad, joint targets of this step and the two before.
         actions: (2, M, 12), this action and the one before.
         acceleration: (M, 12) rad/s^2 of the joints over the step.
+        last_tilt: (M, 2) x and y of gravity in the trunk's frame a gait cycle ago.
         was_contact: (M, 4) bool, contact at the step before.
         sigma_lin, sigma_yaw: scales of the tracking terms.
     """
@@ -57,6 +56,7 @@ class LowStep:
     targets: Array
     actions: Array
     acceleration: Array
+    last_tilt: Array
     was_contact: Array
     sigma_lin: float
     sigma_yaw: float
@@ -182,6 +182,11 @@ def tilt_rate(s: LowStep) -> Array:
     return _square_sum(s.state.body_rate[:, :2])
 
 
+def nodding(s: LowStep) -> Array:
+    """Squared change of the trunk's tilt against a gait cycle ago, of gravity's unit vector."""
+    return _square_sum(s.state.gravity[:, :2] - s.last_tilt)
+
+
 def joint_torques(s: LowStep) -> Array:
     """Squared joint torques, summed, N^2 m^2."""
     return _square_sum(s.state.torque)
@@ -222,6 +227,7 @@ LOW_TERMS: dict[str, Callable[[LowStep], Array]] = {
         joint_limits,
         vertical_velocity,
         tilt_rate,
+        nodding,
         joint_torques,
         joint_speeds,
         joint_accelerations,

@@ -1,7 +1,5 @@
 """The rules of an episode (paper Sec. IV-C; TDGC-Bench, "Episode"): when it ends, and how."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """One robot of a task as a Gymnasium environment; both MDPs have such a face."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -7,8 +7,6 @@ pronk at nearly full speed, its steps timed to a few centimetres, is nothing tha
 trot finds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,42 +14,66 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import CommandRanges
-from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
-from tdgc.tasks.leaps import SPEED, Landing, LeapPlan, leap_command
+from tdgc.tasks.leaps import (
+    BEYOND,
+    FREQUENCIES,
+    SPEED,
+    Landing,
+    LeapPlan,
+    Motion,
+    leap_command,
+    speed_up,
+    steer_leap,
+)
+from tdgc.tasks.planning import LOOK, between, cost_to_go, price_near
 
 
 @dataclass(frozen=True)
 class Style:
-    """How to walk: speed in m/s, frequency in Hz, swing height and stance width in m."""
+    """How to walk in trot.
+
+    Attributes:
+        speed: m/s, ahead.
+        frequency: Hz.
+        swing_height, stance_width, body_height: m.
+        uphill: m/s across a slope, against sliding down, where the slope is vertical; on others as
+            the slope's sine.
+    """
 
     speed: float
     frequency: float = 3.0
     swing_height: float = 0.08
     stance_width: float = 0.25
+    body_height: float = 0.0
+    uphill: float = 0.0
+
+    def command(self) -> Array:
+        """The style as a command, (15,), standing still."""
+        command = default_command()
+        for name in ("frequency", "swing_height", "stance_width", "body_height"):
+            command[INDEX[name]] = getattr(self, name)
+        return command
 
 
 #: A family's style. Numbers beside the defaults of Walk These Ways are from docs/experiments.md.
 STYLES = {
     "rough": Style(0.6, swing_height=0.2, stance_width=0.32),
     "pillar": Style(0.5),
-    "stair": Style(0.6, swing_height=0.2, stance_width=0.35),
+    "stair": Style(0.6, frequency=3.3, swing_height=0.24, stance_width=0.28, body_height=0.05),
     "gap": Style(SPEED),  # in pronk, see ``tdgc.tasks.leaps``
-    "tilt": Style(0.6, frequency=3.5, swing_height=0.2),
+    "tilt": Style(0.6, frequency=3.5, swing_height=0.2, uphill=0.45),
 }
 #: Of families that have none: straight on with high feet, as ``gp`` walks.
 PLAIN = Style(0.6, swing_height=0.2)
-_BEYOND = 0.5  # m behind the last trench, where leaping ends
-_LEAP_TURN = 1.5  # 1/s, yaw rate per rad that a leap is off its heading; as in ``toward``
 
 # The way around pillars follows a field of travel costs on every second sample of the tile.
 _COARSE = 2
-_RADIUS = 0.28  # m: half the trunk's diagonal and a little; two pillars leave 0.6 between them
+_SEEN = 0.5  # share of the speed seen at a decision in the estimate: it swings within a gait cycle
 _WIDE = 0.55  # m from a pillar, where it ceases to cost
-_BLOCKED, _CLOSE = 30.0, 3.0  # cost of a metre inside the radius and at it; 1 in the open
-_LOOK = 0.35  # m ahead, where the robot looks for the lower cost
 _RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)
 
 
@@ -97,20 +119,10 @@ def travel_cost(pillars: Array, width: int, left: float, goal: Array) -> tuple[A
     for cx, cy, diameter in pillars:
         distance = np.hypot(x[:, None] - cx, y - cy) - 0.5 * diameter
         np.minimum(away, distance, out=away)
-    near = np.clip((_WIDE - away) / (_WIDE - _RADIUS), 0.0, 1.0)
-    price = np.where(away < _RADIUS, _BLOCKED, 1.0 + (_CLOSE - 1.0) * near)
-    cost = np.full((len(x) + 2, len(y) + 2), np.inf)  # a border around all
-    inside = np.s_[1:-1, 1:-1]
+    cost = np.full(away.shape, np.inf)
     at = np.clip(np.round((goal - [0.0, left]) / step).astype(int), 0, np.array(away.shape) - 1)
-    cost[at[0] + 1, at[1] + 1] = 0.0
-    shifts = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
-    while True:
-        before = cost[inside].copy()
-        for a, b in shifts:
-            neighbour = cost[1 + a : 1 + a + len(x), 1 + b : 1 + b + len(y)]
-            np.minimum(cost[inside], neighbour + np.hypot(a, b) * step * price, out=cost[inside])
-        if np.array_equal(before, cost[inside]):
-            return cost[inside].copy(), step, left
+    cost[at[0], at[1]] = 0.0
+    return cost_to_go(cost, step * price_near(away, _WIDE)), step, left
 
 
 class Teacher:
@@ -121,6 +133,11 @@ class Teacher:
         families: of the robots, (M,) names.
         ranges: of the commands that their low policy was trained on.
         landing: of the low policy; None for one that does not leap, which walks over trenches.
+
+    Attributes:
+        speed: (M,) m/s ahead, as leaps should have it by now and as it was seen.
+        price: (M, FREQUENCIES) of the last ``commands``, what each step frequency would have cost
+            more than the best one; 0 for robots that do not leap.
     """
 
     def __init__(
@@ -139,25 +156,40 @@ class Teacher:
             PLAIN if family == "gap" and landing is None else STYLES.get(family, PLAIN)
             for family in families
         ]
-        self._command = np.tile(default_command(), (m, 1))
-        for name in ("frequency", "swing_height", "stance_width"):
-            self._command[:, INDEX[name]] = [getattr(style, name) for style in styles]
-        self._speed = np.array([style.speed for style in styles])
+        self._command = np.array([style.command() for style in styles])
+        # A low policy may have been trained on less than the styles ask for.
+        bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
+        behaviour = self._command[:, : len(CONTINUOUS)]
+        np.clip(behaviour, bounds[:, 0], bounds[:, 1], out=behaviour)
+        self.speed = np.zeros(m)
+        self.price = np.zeros((m, FREQUENCIES))
+        self._top_speed = np.array([style.speed for style in styles])
+        self._uphill = np.array([style.uphill for style in styles])
+        self._climb = np.zeros(m)  # m/s to the left of the tile's length
         self._plan = LeapPlan(m, ranges)
+        self._leap_speed = min(SPEED, ranges.vx[1])
         self._end = np.full(m, -np.inf)  # m, x where a robot has no more to leap over
         self._fields: dict[int, tuple[Array, float, float]] = {}
 
     def begin(self, index: NDArray[np.integer], goal: Array) -> None:
         """Look at the tiles of the robots ``index`` (n,); ``goal`` (M, 2) m in the world."""
         width = self._field.heights.shape[1]
+        self.speed[index] = 0.0
+        slopes = [self._field.features[int(i), 0].slope for i in index]
+        self._climb[index] = self._uphill[index] * np.sin(slopes)
         for i in index[self._leaps[index]]:
             trenches = self._field.features[int(i), 0].trenches
             assert self._landing is not None  # or nobody leaps
             self._plan.look(int(i), trenches, self._landing.spread)
-            self._end[i] = trenches[-1, 1] + _BEYOND
+            self._end[i] = trenches[-1, 1] + BEYOND
         for i in index[self._pillars[index]]:
             pillars, target = self._field.features[int(i), 0].pillars, goal[i] - self._origin[i]
             self._fields[int(i)] = travel_cost(pillars, width, self._field.crop, target)
+
+    def watch(self, loco: Locomotion, seconds: float) -> None:
+        """See how fast the robots are, once per decision of ``seconds``."""
+        _, self.speed = speed_up(self.speed, self._leap_speed, seconds)
+        self.speed += _SEEN * (loco.world.state.heading_vel[:, 0] - self.speed)
 
     def commands(self, loco: Locomotion, goal: Array) -> Array:
         """Commands (M, 15) for the coming decision; ``goal`` (M, 2) m in the world."""
@@ -167,29 +199,31 @@ class Teacher:
         bearing = np.arctan2(offset[:, 1], offset[:, 0])
         local = state.position[:, :2] - self._origin
         for i, field in self._fields.items():
-            if distance[i] > _LOOK:
+            if distance[i] > LOOK:
                 bearing[i] = _downhill(field, local[i], bearing[i])
         error = wrap_angle(bearing - state.yaw)
         command = self._command.copy()
-        speed, turn = toward(distance, error, self._speed, turns=self._ranges.yaw_rate)
-        command[:, INDEX["vx"]], command[:, INDEX["yaw_rate"]] = speed, turn
+        speed, turn = toward(distance, error, self._top_speed, turns=self._ranges.yaw_rate)
+        # Between pillars any way it faces: backward, too, off one that it leans on.
+        any_way = np.where(self._pillars, np.minimum(self._top_speed, distance), 0.0)
+        speed = np.where(self._pillars, any_way * np.cos(error), speed)
+        command[:, INDEX["vx"]] = speed + self._climb * np.sin(state.yaw)
+        command[:, INDEX["vy"]] = any_way * np.sin(error) + self._climb * np.cos(state.yaw)
+        command[:, INDEX["yaw_rate"]] = turn
+        for name in ("vx", "vy"):
+            column = command[:, INDEX[name]]
+            np.clip(column, *getattr(self._ranges, name), out=column)
+        self.price[:] = 0.0
         rows = np.flatnonzero(self._leaps & (local[:, 0] < self._end))
         if rows.size and self._landing is not None:
-            # Facing across the trenches both feet of a pair land on one line; sideways to the goal.
-            leaps, fast = command[rows], self._speed[rows]
-            leaps[:, INDEX["vx"]] = fast * np.cos(bearing[rows])
-            leaps[:, INDEX["vy"]] = np.clip(fast * np.sin(bearing[rows]), *self._ranges.vy)
-            turn = np.clip(-_LEAP_TURN * state.yaw[rows], *self._ranges.yaw_rate)
-            leaps[:, INDEX["yaw_rate"]] = turn
-            steps = self._plan.steps(
-                rows,
-                local[rows, 0],
-                state.heading_vel[rows, 0],
-                loco.clock.clock[rows],
-                self._landing,
-            )
-            leap_command(leaps, *steps)
-            command[rows] = leaps
+            leaps = command[rows]
+            steer_leap(leaps, bearing[rows], state.yaw[rows], self._ranges)
+            commanded = np.full(len(rows), self._leap_speed)
+            clock = loco.clock.clock[rows]
+            motion = Motion(local[rows, 0], self.speed[rows], commanded, clock)
+            lesson = self._plan.lesson(rows, motion, self._landing)
+            leap_command(leaps, lesson.frequency, lesson.length)
+            command[rows], self.price[rows] = leaps, lesson.price
         return command
 
 
@@ -197,14 +231,9 @@ def _downhill(field: tuple[Array, float, float], at: Array, ahead: float) -> flo
     """Direction in rad from ``at`` (2,) m in which the travel cost falls most; near ties go to the
     one closest to ``ahead``."""
     cost, step, left = field
-    x, y = at[0] + _LOOK * np.cos(_RAYS), at[1] + _LOOK * np.sin(_RAYS)
-    u = np.clip(x / step, 0.0, cost.shape[0] - 1.001)
-    v = np.clip((y - left) / step, 0.0, cost.shape[1] - 1.001)
-    i, j = u.astype(int), v.astype(int)
-    a, b = u - i, v - j
-    value = (1 - a) * ((1 - b) * cost[i, j] + b * cost[i, j + 1]) + a * (
-        (1 - b) * cost[i + 1, j] + b * cost[i + 1, j + 1]
-    )
-    value = value + 0.01 * np.abs(wrap_angle(_RAYS - ahead))
+    x, y = at[0] + LOOK * np.cos(_RAYS), at[1] + LOOK * np.sin(_RAYS)
+    cells = np.column_stack([x / step, (y - left) / step])
+    value = between(cost, np.clip(cells, 0.0, np.array(cost.shape) - 1.001))
+    value += 0.01 * np.abs(wrap_angle(_RAYS - ahead))
     value[(x < 0.0) | (x > TILE_SIZE)] = np.inf
     return float(_RAYS[value.argmin()])

@@ -3,8 +3,6 @@
 A tile follows from the seed and its number, so a checkpoint holds numbers instead of heights.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 

@@ -1,0 +1,87 @@
+"""The decision-level MDP (paper Sec. IV-B) and its curriculum (Sec. IV-C)."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from tdgc.config.sim import CommandRanges, RandomisationConfig
+
+
+@dataclass(frozen=True)
+class HighRewardConfig:
+    """Weights and constants of the high policy's reward (Sec. IV-B), one weight per term.
+
+    Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the step's
+    duration, unless ``step_time_scaling`` is off: then they are per decision.
+    """
+
+    step_time_scaling: bool = field(default=True, metadata={"before": True})
+
+    goal_distance: float = 1.0
+    face: float = 0.2
+    arrive: float = 2.0
+    stable: float = 0.5
+    action_rate: float = -0.01
+    command_rate: float = -0.2
+    command_acceleration: float = -0.1
+    contact_force: float = -0.01
+    laziness: float = -0.5
+    alive: float = 0.1
+    map_radius: float = 8.0  # m, R_map: the tile's length
+    curve_gain: float = 1.0  # a of the goal distance
+    curve_rate: float = 3.0  # b of the goal distance
+    goal_radius: float = 0.5  # m, d_0: the paper's reach distance
+    arrive_base: float = 1.0  # b_0
+    arrive_speed: float = 2.0  # b_1: what an early arrival adds
+    joint_speed_weight: float = 0.05  # beta of eta_t
+    height_scale: float = 0.01  # m^2, sigma_z
+    force_threshold: float = 1.0  # N, F_th
+    lazy_speed: float = 0.1  # m/s, v_th
+
+
+_GAITS: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = ("trot", "pronk", "pace", "bound")
+
+
+@dataclass(frozen=True)
+class HighLevelConfig:
+    """The decision-level MDP (Sec. IV-B) and its curriculum (Sec. IV-C)."""
+
+    decimation: int = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
+    cues: Literal["both", "semantic", "geometric", "none"] = "both"
+    # Gaits that the gait channel chooses from, in equal shares of its range.
+    gaits: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = field(
+        default=_GAITS, metadata={"before": _GAITS}
+    )
+    # What it decides: all commands, or the velocities and the gait. The other commands then stay at
+    # their defaults, or as near as ``commands`` lets them.
+    behaviour: Literal["all", "velocities"] = field(default="all", metadata={"before": "all"})
+    # What the high policy sees of the gait clock. The paper's phi is the sine alone, which in pronk
+    # does not tell feet that touch down from feet that take off.
+    clock: Literal["sine", "both"] = field(default="both", metadata={"before": "sine"})
+    # Where the heights of the geometric cue are probed, see ``tdgc.tasks.probes``.
+    probes: Literal["lines", "staggered"] = field(default="lines", metadata={"before": "staggered"})
+    # Whether it is told how old the probes' heights are, as a sensor's time stamp does.
+    probe_age: bool = field(default=True, metadata={"before": False})
+    # Share of the robots in training that are told an unknown family, so that the probes alone have
+    # to do: tiles of several families, or of none that has a name.
+    unknown_share: float = 0.2
+    # Trenches, which are leapt to a few centimetres, take twice the robots of the others.
+    families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "gap", "tilt")
+    levels: int = 11  # L_max: levels 0..10
+    # How levels are chosen in training: by each robot's performance, as the paper has it; drawn
+    # uniformly for each episode; or always the hardest.
+    curriculum: Literal["performance", "uniform", "hardest"] = field(
+        default="performance", metadata={"before": "performance"}
+    )
+    # m: in training trenches are this deep on level 0 and deepen from there, see
+    # ``tdgc.tasks.tiles.shallow``; null: all of them are as deep as in the benchmark.
+    shallowest_trench: float | None = field(default=None, metadata={"before": None})
+    window: int = 4  # W episodes: short, since an episode of every robot takes minutes on two cores
+    threshold: int = 3  # S successes of them
+    first_levels: int = 1  # robots begin spread over levels 0..first_levels-1
+    episode_seconds: float = 20.0  # T_max (benchmark)
+    hold_seconds: float = 2.0  # an episode goes on that long after the goal was reached
+    action_limit: float = 1.0  # a_max of the decoder
+    # The decoder's bounds; all that the low policy was trained on where there are none.
+    commands: CommandRanges | None = None
+    rewards: HighRewardConfig = field(default_factory=HighRewardConfig)
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)

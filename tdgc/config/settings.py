@@ -1,0 +1,208 @@
+"""Configurations to and from JSON, and ``--set key=value``: dataclasses with checked values.
+
+``with_overrides`` applies ``key=value`` pairs, ``to_dict`` and ``from_dict`` go to and from JSON.
+Unknown keys, values of the wrong type and values outside the allowed range raise ``ConfigError``.
+"""
+
+import dataclasses
+import json
+import math
+import reprlib
+import types
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from tdgc.errors import InputError
+
+Range = typing.Annotated[tuple[float, float], "low <= high"]
+Share = typing.Annotated[float, "0 to 1"]
+#: Of trot, pronk, pace and bound.
+GaitShares = typing.Annotated[tuple[Share, Share, Share, Share], "1 together"]
+
+
+class ConfigError(InputError):
+    """A configuration that cannot be used; the message is one line."""
+
+
+Config = TypeVar("Config")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Nested plain dict of a configuration, ready for JSON (tuples become lists)."""
+    return typing.cast(dict[str, Any], json.loads(json.dumps(dataclasses.asdict(config))))
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        ConfigError: a file that cannot be read or is no JSON, or a key that stands twice.
+    """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        table = dict(pairs)
+        if len(table) < len(pairs):
+            keys = [key for key, _ in pairs]
+            twice = next(key for key in keys if keys.count(key) > 1)
+            raise ConfigError(f"{path}: the key '{twice}' stands twice")
+        return table
+
+    try:
+        return json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=unique)
+    except ConfigError:
+        raise
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not a JSON file") from error
+
+
+def from_dict(cls: type[Config], data: Mapping[str, Any], where: str = "") -> Config:
+    """Build ``cls`` from a plain dict; missing keys keep their defaults.
+
+    Raises:
+        ConfigError: a key that ``cls`` does not have, or a value of the wrong type.
+    """
+    if not isinstance(data, Mapping):
+        shown = reprlib.repr(data)
+        raise ConfigError(f"{where or cls.__name__} must be a table of keys, not {shown}")
+    hints = typing.get_type_hints(cls, include_extras=True)
+    names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    values = {}
+    for key, value in data.items():
+        path = f"{where}.{key}" if where else str(key)
+        if key not in names:
+            raise ConfigError(f"unknown configuration key '{path}'; allowed: {', '.join(names)}")
+        values[key] = _coerce(hints[key], value, path)
+    return cls(**values)
+
+
+def recorded(cls: type[Config], data: Mapping[str, Any], source: object) -> Config:
+    """Build ``cls`` from what a policy or a run has written down, which must name every key.
+
+    What was trained with one value must not be run with today's default of a key that came later.
+
+    Raises:
+        ConfigError: as ``from_dict``, or a key that is missing; the message begins with ``source``.
+    """
+    try:
+        config = from_dict(cls, _with_before(cls, data))
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from error
+    for key, value in _missing(to_dict(config), _with_before(cls, data)):
+        raise ConfigError(f"{source}: no key '{key}', by default {value}; say what it was")
+    return config
+
+
+def _with_before(cls: Any, data: Any) -> Any:
+    """``data``, and for each setting of ``cls`` that came later what it was before."""
+    if not isinstance(data, Mapping):
+        return data
+    filled = dict(data)
+    hints = typing.get_type_hints(cls)
+    for f in dataclasses.fields(cls):
+        if f.name in data and dataclasses.is_dataclass(hints[f.name]):
+            filled[f.name] = _with_before(hints[f.name], data[f.name])
+        elif f.name not in data and "before" in f.metadata:
+            filled[f.name] = f.metadata["before"]
+    return filled
+
+
+def _missing(whole: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Dotted keys of ``whole`` that ``data`` lacks, and their values."""
+    for key, value in whole.items():
+        if isinstance(value, dict):
+            below = _missing(value, data.get(key, {}))
+            yield from ((f"{key}.{name}", default) for name, default in below)
+        elif key not in data:
+            yield key, json.dumps(value)
+
+
+def with_overrides(config: Config, assignments: Iterable[str]) -> Config:
+    """Apply ``dotted.key=value`` strings, values written as in JSON (bare words are strings).
+
+    Raises:
+        ConfigError: an assignment without ``=``, an unknown key, or a value of the wrong type.
+    """
+    for text in assignments:
+        key, equals, raw = text.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"cannot read --set '{text}'; write key=value, e.g. kp=25")
+        try:
+            value = json.loads(raw)
+        except (ValueError, RecursionError):
+            value = raw
+        config = _replace(config, key.strip().split("."), value, key.strip())
+    return config
+
+
+def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
+    names = [f.name for f in dataclasses.fields(config)]
+    head, rest = path[0], path[1:]
+    if head not in names:
+        raise ConfigError(f"unknown configuration key '{full}'; allowed: {', '.join(names)}")
+    child = getattr(config, head)
+    if rest:
+        if child is None:  # a table that may be left out
+            options = typing.get_args(typing.get_type_hints(type(config))[head])
+            table = next((o for o in options if dataclasses.is_dataclass(o)), None)
+            child = None if table is None else typing.cast(type, table)()
+        if not dataclasses.is_dataclass(child):
+            raise ConfigError(f"'{full}': '{head}' is a value, it has no keys of its own")
+        return dataclasses.replace(config, **{head: _replace(child, rest, value, full)})
+    hint = typing.get_type_hints(type(config), include_extras=True)[head]
+    return dataclasses.replace(config, **{head: _coerce(hint, value, full)})
+
+
+def _coerce(hint: Any, value: Any, path: str) -> Any:
+    """``value`` as the annotated type: the few that configurations use, and nothing else."""
+    origin = typing.get_origin(hint)
+    shown = reprlib.repr(value)  # short, whatever the file holds
+    if origin is typing.Annotated:
+        checked = _coerce(typing.get_args(hint)[0], value, path)
+        if hint == Range and checked[0] > checked[1]:
+            raise ConfigError(f"'{path}' must be [low, high] with low <= high, not {shown}")
+        if hint == Share and not 0.0 <= checked <= 1.0:
+            raise ConfigError(f"'{path}' must be from 0 to 1, not {shown}")
+        if hint == GaitShares and not math.isclose(sum(checked), 1.0):
+            raise ConfigError(f"'{path}' must add up to 1, not {shown}")
+        return checked
+    if origin is Literal:
+        if value not in typing.get_args(hint):
+            allowed = ", ".join(typing.get_args(hint))
+            raise ConfigError(f"'{path}' must be one of {allowed}, not {shown}")
+        return value
+    if dataclasses.is_dataclass(hint):
+        return from_dict(typing.cast(type, hint), value, path)
+    if origin in (typing.Union, types.UnionType):
+        options = typing.get_args(hint)
+        if value is None and type(None) in options:
+            return None
+        return _coerce(next(o for o in options if o is not type(None)), value, path)
+    if origin is tuple:
+        args = typing.get_args(hint)
+        if not isinstance(value, (list, tuple)):
+            raise ConfigError(f"'{path}' must be a list, not {shown}")
+        if args[-1] is Ellipsis:
+            return tuple(_coerce(args[0], v, path) for v in value)
+        if len(value) != len(args):
+            raise ConfigError(f"'{path}' must have {len(args)} values, not {len(value)}")
+        return tuple(_coerce(a, v, path) for a, v in zip(args, value, strict=True))
+    if hint is bool and isinstance(value, bool):
+        return value
+    if hint is int and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number beyond the largest float
+            number = math.inf
+        if not math.isfinite(number):
+            raise ConfigError(f"'{path}' must be a finite number, not {shown}")
+        return number
+    if hint is str and isinstance(value, str):
+        return value
+    kind = getattr(hint, "__name__", str(hint))
+    raise ConfigError(f"'{path}' must be of type {kind}, not {shown}")

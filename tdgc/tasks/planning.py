@@ -1,0 +1,46 @@
+"""The way around pillars, on a grid: what a place costs, and the least cost from there on."""
+
+import numpy as np
+
+from tdgc.sim.robot import Array
+
+LOOK = 0.35  # m ahead, where a robot looks for the lower cost
+#: m from a pillar that is blocked: half the trunk's diagonal and a little. Two pillars leave 0.6 m
+#: between them.
+RADIUS = 0.28
+_BLOCKED, _CLOSE = 30.0, 3.0  # cost of a metre inside the radius and at it; 1 in the open
+_AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
+
+
+def price_near(away: Array, wide: float) -> Array:
+    """Cost of a metre ``away`` (...) m from the nearest pillar, which costs up to ``wide`` m."""
+    near = np.clip((wide - away) / (wide - RADIUS), 0.0, 1.0)
+    return np.where(away < RADIUS, _BLOCKED, 1.0 + (_CLOSE - 1.0) * near)
+
+
+def cost_to_go(cost: Array, price: Array) -> Array:
+    """Least cost of getting out from each cell of a grid, (n, m).
+
+    Args:
+        cost: (n, m) where one is out; inf elsewhere.
+        price: (n, m) of a step of one cell from each; one aslant is longer.
+    """
+    n, m = cost.shape
+    while True:
+        wide = np.pad(cost, 1, constant_values=np.inf)
+        steps = [
+            wide[1 + a : 1 + a + n, 1 + b : 1 + b + m] + np.hypot(a, b) * price for a, b in _AROUND
+        ]
+        settled = np.minimum(cost, np.min(steps, axis=0))
+        if np.array_equal(settled, cost):
+            return cost
+        cost = settled
+
+
+def between(grid: Array, at: Array) -> Array:
+    """Values (k,) of a grid (n, m) between its cells, at (k, 2) in cells."""
+    i, j = np.floor(at).astype(int).T
+    a, b = at.T - (i, j)
+    return (1 - a) * ((1 - b) * grid[i, j] + b * grid[i, j + 1]) + a * (
+        (1 - b) * grid[i + 1, j] + b * grid[i + 1, j + 1]
+    )
