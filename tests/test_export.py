@@ -259,7 +259,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(
                     "last_decision": last[k],
                     "last_commands": loco.command[k],
                     "clock": loco.clock.clock[k : k + 1],
-                    "family": np.eye(6)[k],
+                    "family": np.eye(6)[task.family_index[k]],
                     "probes": np.where(np.abs(heights[k]) < 0.5, 1.0, 3.0) * heights[k],
                     "probe_age": 0.08 * late[k : k + 1],
                     "hidden": memory[0, k],
