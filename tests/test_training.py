@@ -401,7 +401,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         train_high.main([*arguments, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     )
     assert [row["steps"] for row in rows(whole)] == [16, 32]
-    # After half of imitation (2e-3 to 2e-4), and after 24 of 40 steps of the whole (1.5e-4 to 5e-5).
+    # Half way from 2e-3 to 2e-4 in imitation; after 24 of 40 steps from 1.5e-4 to 5e-5.
     rates = [row["train/learning_rate"] for row in rows(whole)]
     assert rates == pytest.approx([1.1e-3, 5e-5 + 0.4 * 1e-4])
     last = broken / "checkpoints/step-000000000024"
