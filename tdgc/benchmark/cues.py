@@ -97,9 +97,9 @@ class CuesLaw:
             velocity = state.command[:, [INDEX["vx"], INDEX["vy"]]]
             state.where.move(distance, bearing, velocity, self._dt)
         self._look(state, cue)
-        state.command = self._walk(state, distance, bearing)
+        before, state.command = state.command, self._walk(state, distance, bearing)
         if self._landing is not None:
-            self._leap(state, cue, bearing, self._landing)
+            self._leap(state, cue, bearing, before, self._landing)
         # A low policy may have been trained on less than the styles ask for.
         state.command = np.clip(state.command, self._decoder.low, self._decoder.high)
         return self._decoder.encode(state.command), state
@@ -147,9 +147,12 @@ class CuesLaw:
         return command
 
     def _leap(
-        self, memory: Memory, cue: dict[str, Array], bearing: Array, landing: Landing
+        self, memory: Memory, cue: dict[str, Array], bearing: Array, before: Array, landing: Landing
     ) -> None:
-        """Turn the commands of robots that have trenches before them into those of leaps."""
+        """Turn the commands of robots that have trenches before them into those of leaps.
+
+        ``before`` (M, 15) are the commands of the decision before.
+        """
         track = memory.profile.track()
         tracks = np.maximum(track, 0).tolist()
         chosen = tracks, np.arange(len(tracks))
@@ -175,6 +178,7 @@ class CuesLaw:
             phase = np.arctan2(cue["clock"][rows, 1], cue["clock_cosine"][rows, 1])
             clock = np.mod(phase / (2.0 * np.pi), 1.0)
             commanded = np.full(len(rows), min(SPEED, self._ranges.vx[1]))
-            motion = Motion(x[rows], speed[rows], commanded, clock)
+            stride = before[rows][:, [INDEX["frequency"], INDEX["stance_length"]]].T
+            motion = Motion(x[rows], speed[rows], commanded, clock, *stride)
             leap_command(leaps, *memory.plan.steps(rows, motion, landing))
             memory.command[rows] = leaps

@@ -103,7 +103,11 @@ class ImitationConfig:
     steps: int = 640_000  # decisions altogether; 0 leaves everything to reinforcement learning
     learning_rate: float = 2e-3
     final_learning_rate: float = 2e-4  # reached linearly at the last of the steps
-    n_epochs: int = 8
+    # How little a frequency costs more than the teacher's depends on the updates that there were:
+    # 0.19, 0.15 and 0.12 after 1, 4 and 10 thousand of them on the same 90,000 decisions
+    # (docs/experiments.md). An update takes a tenth of the time of the decisions behind it.
+    n_epochs: int = 16
+    minibatches: int = field(default=8, metadata={"before": 4})
 
 
 @dataclass(frozen=True)

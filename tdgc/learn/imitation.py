@@ -24,7 +24,7 @@ from tdgc.tasks.leaps import FREQUENCIES
 _FREQUENCY = INDEX["frequency"]
 # As in the comparison of docs/experiments.md: what a price weighs against a squared error in the
 # action, and what is left of that error of a frequency that has a price.
-_PRICE_WEIGHT, _PRICED = 4.0, 0.1
+_PRICE_WEIGHT, _PRICED = 10.0, 0.1
 
 
 class ApprenticePolicy(FastRecurrentPolicy):

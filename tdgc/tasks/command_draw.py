@@ -9,6 +9,7 @@ from tdgc.config import LowLevelConfig
 from tdgc.sim.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.robot import Array
+from tdgc.tasks.leaps import LONGEST
 
 _FALLS = 256  # of a task's robots, the last ones: a few minutes of walking
 # Of ``low_statistics.by_gait``, what a gait is judged by: samples, and sums over them.
@@ -54,7 +55,8 @@ class CommandDraw:
         self, gaits: Array, low: Array, high: Array, free: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
         """Gaits (n,) and continuous commands (n, 12) from such ``bounds``, and which of them (n,)
-        are tried again; of the ``free`` ones (n,) some leap, and some are what robots fell at."""
+        are tried again; of the ``free`` ones (n,) some leap, and some are what robots fell at. In
+        pronk the steps are at least as quick as ``leaps.LONGEST`` asks for."""
         n, rng, config = len(free), self._rng, self._config.command_draw
         gait = np.sum(rng.uniform(size=(n, 1)) > np.cumsum(gaits, axis=1)[:, :-1], axis=1)
         values = rng.uniform(low, high)
@@ -65,6 +67,9 @@ class CommandDraw:
             values[leap, j] = low[leap, j] + share * (high - low)[leap, j]
         values[:, :3] *= self.share[gait][:, None]
         values[rng.uniform(size=n) < config.standing, :3] = 0.0
+        pronk, frequency = gait == PRONK, INDEX["frequency"]
+        least = np.hypot(values[pronk, 0], values[pronk, 1]) / LONGEST
+        values[pronk, frequency] = np.maximum(values[pronk, frequency], least)
         again = free & (rng.uniform(size=n) < config.retries)
         rows = self.falls[rng.integers(0, _FALLS, n)]
         again &= rows[:, 0] >= 0.0

@@ -17,7 +17,7 @@ from tdgc.sim.terrain import MAX_LEVEL, TILE_SIZE, TileField
 from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import Ground
-from tdgc.tasks.leaps import DURATION, SWING_HEIGHT, Landing, LeapPlan, Motion
+from tdgc.tasks.leaps import DURATION, SPEED, STRIDE, SWING_HEIGHT, Landing, LeapPlan, Motion
 from tdgc.tasks.rules import GOAL_RADIUS
 from tdgc.tasks.tiles import FLAT
 
@@ -98,14 +98,16 @@ class Crossings:
 
     def draw(self, index: NDArray[np.integer], gait: Ints, values: Array, grown: float) -> None:
         """Draw how the robots ``index`` (n,) cross with the gaits (n,) and continuous commands
-        (n, 12) drawn for them; swing height and duty factor of leaps are changed in place. Leaps
-        are ``grown`` times as fast as they will be: the share of the velocity ranges that pronk
+        (n, 12) drawn for them; those of leaps are changed in place, but for posture. Leaps are
+        ``grown`` times as fast as they will be: the share of the velocity ranges that pronk
         has come to."""
         n, rng, c, e = len(index), self._rng, self._config, self._episodes
         leaps = e.crossing[index] & self.leapers[index] & (gait == PRONK)
         swing = INDEX["swing_height"]
         values[leaps, swing] = rng.uniform(self._low[swing], SWING_HEIGHT, int(leaps.sum()))
         values[leaps, INDEX["duration"]] = DURATION  # which landings are planned for
+        for j, usual in ((_FREQUENCY, SPEED / STRIDE), (_LENGTH, STRIDE)):  # until the first one
+            values[leaps, j] = np.clip(usual, self._low[j], self._high[j])
         e.leaping[index] = leaps
         e.follow[index] = np.where(leaps, 0.0, rng.uniform(size=n))
         e.pitch[index] = values[:, _PITCH]
@@ -148,6 +150,8 @@ class Crossings:
                 state.heading_vel[rows, 0],
                 e.speed[rows],
                 loco.clock.clock[rows],
+                loco.command[rows, _FREQUENCY],
+                loco.command[rows, _LENGTH],
             )
             frequency, length = self._plan.steps(rows, motion, self.landing)
             loco.command[rows, _FREQUENCY], loco.command[rows, _LENGTH] = frequency, length

@@ -219,8 +219,9 @@ class Teacher:
             leaps = command[rows]
             steer_leap(leaps, bearing[rows], state.yaw[rows], self._ranges)
             commanded = np.full(len(rows), self._leap_speed)
+            stride = loco.command[rows][:, [INDEX["frequency"], INDEX["stance_length"]]].T
             clock = loco.clock.clock[rows]
-            motion = Motion(local[rows, 0], self.speed[rows], commanded, clock)
+            motion = Motion(local[rows, 0], self.speed[rows], commanded, clock, *stride)
             lesson = self._plan.lesson(rows, motion, self._landing)
             leap_command(leaps, lesson.frequency, lesson.length)
             command[rows], self.price[rows] = leaps, lesson.price
