@@ -130,7 +130,7 @@ def test_lips_are_where_probes_met_them(
     track = law.memory.profile.track()
     found = [law.memory.profile.trenches(i, max(track[i], 0), 0.3)[0, 0] for i in range(4)]
     there = [tile_of(11, "gap", 4, i).features.trenches[0, 0] for i in range(4)]
-    np.testing.assert_allclose(found, there, atol=0.05)
+    np.testing.assert_allclose(found, there, atol=0.06)
 
 
 def test_the_slope_is_seen_by_the_probes_at_either_side(

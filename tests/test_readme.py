@@ -55,7 +55,7 @@ class Run:
 LOW = "--steps 128 --n-envs 4 --workers 1 --set log_steps=128 --set calibration.robots=0"
 HIGH = (
     "--steps 16 --n-envs 4 --workers 1 --set log_steps=8 "
-    "--set ppo.n_steps=2 --set ppo.minibatches=1"
+    "--set ppo.n_steps=2 --set ppo.minibatches=1 --set imitation.minibatches=1"
 )
 ONE = "--episodes 1 --workers 1"
 FALL = f"--policies gp --families gap --levels 10 {ONE}"  # in the first trench, within seconds

@@ -108,7 +108,7 @@ def test_turns_to_the_goal_and_slows_before_it(course) -> None:
     course.put(1.0, yaw=-0.4)
     command = course.commands()[0]
     assert command[INDEX["yaw_rate"]] == pytest.approx(0.6)
-    assert command[INDEX["vx"]] == pytest.approx(0.6 * np.cos(0.4))
+    assert command[INDEX["vx"]] == pytest.approx(STYLES["stair"].speed * np.cos(0.4))
     course.put(7.05)
     assert course.commands()[0, INDEX["vx"]] == pytest.approx(0.2)
 

@@ -391,7 +391,8 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     arguments = [
         "--seed", "3", "--n-envs", "2", "--workers", "1", "--steps", "40",
         "--set", "checkpoint_seconds=0", "--set", "log_steps=16", "--set", "ppo.n_steps=4",
-        "--set", "ppo.minibatches=2", "--set", "imitation.minibatches=2", "--set", "ppo.n_epochs=2", "--set", "ppo.lstm=8",
+        "--set", "ppo.minibatches=2", "--set", "imitation.minibatches=2", "--set", "ppo.n_epochs=2",
+        "--set", "ppo.lstm=8",
         "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.7",
         "--set", "imitation.steps=16",
     ]  # fmt: skip

@@ -75,6 +75,7 @@ class GoToGoal:
     distance_gain: float = 1.0  # 1/s
     heading_gain: float = 1.5  # 1/s
     swing_height: float = 0.2  # m
+    body_height: float = 0.04  # m, added to the standing height
 
     def law(self, position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
         """Forward speed and yaw rate: positions (M, 2), headings (M,), goals (M, 2)."""
@@ -95,7 +96,8 @@ class BaselineDriver(Driver):
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
         self._command = np.tile(default_command(), (loco.num_robots, 1))
-        self._command[:, INDEX["swing_height"]] = self.law.swing_height
+        for name in ("swing_height", "body_height"):
+            self._command[:, INDEX[name]] = getattr(self.law, name)
 
     def command(self, step: int) -> Array:
         state = self._loco.world.state

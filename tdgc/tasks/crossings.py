@@ -24,6 +24,8 @@ from tdgc.tasks.tiles import FLAT
 Ints = NDArray[np.int64]
 _YAW_RATE, _PITCH = INDEX["yaw_rate"], INDEX["pitch"]
 _FREQUENCY, _LENGTH = INDEX["frequency"], INDEX["stance_length"]
+# m from a lip, further than leaps have to be: what is learned here is to land where it is asked for
+_CLEAR = 0.08
 
 
 class Crossings:
@@ -53,7 +55,7 @@ class Crossings:
         self._low, self._high = np.array([getattr(config.commands, n) for n in CONTINUOUS]).T
         self.flat = np.array([family == FLAT for family in families])
         self.leapers = np.array([family == "gap" for family in families])
-        self._plan = LeapPlan(len(families), config.commands)
+        self._plan = LeapPlan(len(families), config.commands, _CLEAR)
         self.landing = Landing()
 
     def look(self, field: TileField, index: NDArray[np.integer]) -> None:

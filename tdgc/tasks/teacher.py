@@ -40,6 +40,8 @@ class Style:
         speed: m/s, ahead.
         frequency: Hz.
         swing_height, stance_width, body_height: m.
+        duration: duty factor.
+        pitch: rad, nose down positive.
         uphill: m/s across a slope, against sliding down, where the slope is vertical; on others as
             the slope's sine.
     """
@@ -49,12 +51,16 @@ class Style:
     swing_height: float = 0.08
     stance_width: float = 0.25
     body_height: float = 0.0
+    duration: float = 0.5
+    pitch: float = 0.0
     uphill: float = 0.0
 
     def command(self) -> Array:
         """The style as a command, (15,), standing still."""
         command = default_command()
-        for name in ("frequency", "swing_height", "stance_width", "body_height"):
+        for name in (
+            "frequency", "swing_height", "stance_width", "body_height", "duration", "pitch"
+        ):  # fmt: skip
             command[INDEX[name]] = getattr(self, name)
         return command
 
@@ -63,9 +69,18 @@ class Style:
 STYLES = {
     "rough": Style(0.6, swing_height=0.2, stance_width=0.32),
     "pillar": Style(0.5),
-    "stair": Style(0.6, frequency=3.3, swing_height=0.24, stance_width=0.28, body_height=0.05),
-    "gap": Style(SPEED),  # in pronk, see ``tdgc.tasks.leaps``
-    "tilt": Style(0.6, frequency=3.5, swing_height=0.2, uphill=0.45),
+    "stair": Style(
+        0.5,
+        frequency=2.2,
+        swing_height=0.24,
+        stance_width=0.27,
+        body_height=0.05,
+        duration=0.55,
+        pitch=-0.07,
+    ),
+    # in pronk, see ``tdgc.tasks.leaps``
+    "gap": Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1),
+    "tilt": Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45),
 }
 #: Of families that have none: straight on with high feet, as ``gp`` walks.
 PLAIN = Style(0.6, swing_height=0.2)

@@ -1,0 +1,57 @@
+"""The shipped pair is what today's commands give."""
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tdgc import policies
+from tdgc.config import HighTrainConfig, LowTrainConfig, to_dict
+from tdgc.sim.terrain import EDITION
+from tdgc.tasks.high_env import PRETRAINED, load_low, paired
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def plain(config: object) -> Any:
+    return json.loads(json.dumps(to_dict(config)))
+
+
+def rows(name: str) -> list[dict[str, Any]]:
+    text = (PRETRAINED / f"{name}_run" / "log.jsonl").read_text(encoding="utf-8")
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_the_low_policy_was_trained_with_the_defaults() -> None:
+    config = plain(LowTrainConfig())
+    assert read(PRETRAINED / "low_run" / "config.json") == config
+    meta = policies.load(PRETRAINED / "low").meta
+    assert meta["config"] == config["env"] and meta["calibration"]["robots"] == 4800
+
+
+def test_the_high_policy_was_trained_with_the_defaults() -> None:
+    """On the shipped low policy."""
+    _, low = load_low(PRETRAINED / "low")
+    defaults = HighTrainConfig()
+    config = plain(defaults) | {"env": plain(paired(defaults.env, low)), "low": "runs/low/policy"}
+    assert read(PRETRAINED / "high_run" / "config.json") == config
+    meta = policies.load(PRETRAINED / "high").meta
+    assert meta["config"] == config["env"] and meta["low"]["config"] == plain(low)
+
+
+@pytest.mark.parametrize(
+    ("name", "config"), [("low", LowTrainConfig()), ("high", HighTrainConfig())]
+)
+def test_logs_are_of_one_run_from_its_first_step_to_its_last(
+    name: str, config: LowTrainConfig | HighTrainConfig
+) -> None:
+    steps = [row["steps"] for row in rows(name)]
+    assert steps == sorted(set(steps)) and steps[0] < 1.1 * config.log_steps
+    assert 0.99 * config.steps < steps[-1] <= config.steps
+    assert max(b - a for a, b in itertools.pairwise(steps)) < 2.0 * config.log_steps
+    meta = policies.load(PRETRAINED / name).meta
+    assert meta["steps"] == config.steps and meta["benchmark"] == EDITION
