@@ -51,7 +51,7 @@ def test_logs_are_of_one_run_from_its_first_step_to_its_last(
 ) -> None:
     steps = [row["steps"] for row in rows(name)]
     assert steps == sorted(set(steps)) and steps[0] < 1.1 * config.log_steps
-    assert 0.99 * config.steps < steps[-1] <= config.steps
+    assert 0.99 * config.steps < steps[-1] < 1.01 * config.steps
     assert max(b - a for a, b in itertools.pairwise(steps)) < 2.0 * config.log_steps
     meta = policies.load(PRETRAINED / name).meta
-    assert meta["steps"] == config.steps and meta["benchmark"] == EDITION
+    assert config.steps <= meta["steps"] < 1.01 * config.steps and meta["benchmark"] == EDITION
