@@ -151,8 +151,8 @@ def test_sensing_is_in_the_frames_that_the_interface_names(controller: Controlle
     assert seen["goal"] == pytest.approx([4.0, 0.0])  # ahead
     assert seen["gyro"] == pytest.approx([0.0, -1.0, 0.5])
     assert seen["family"].tolist() == [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
-    # The first probe is 0.25 m behind and 0.1 m to the left, so at (1.9, 2.75) in the world.
-    assert seen["probes"][0] == pytest.approx(0.19 + 2.75 - (0.35 - 0.3))
+    # The first probe is 0.1 m ahead, so at (2.0, 3.1) in the world.
+    assert seen["probes"][0] == pytest.approx(0.2 + 3.1 - (0.35 - 0.3))
     down = state(controller, quaternion=[0.0, np.sin(half / 2), 0.0, np.cos(half / 2)])
     assert controller.sense(down, np.ones(2), "?", level)["gravity"][0] > 0.7  # nose down
     assert controller.sense(down, np.ones(2), "?", level)["family"][-1] == 1.0

@@ -120,6 +120,7 @@ def test_baseline_holds_the_default_behaviour_parameters(low):
         expected = default_command()
         expected[INDEX["vx"]] = driver.law.top_speed
         expected[INDEX["swing_height"]] = driver.law.swing_height
+        expected[INDEX["body_height"]] = driver.law.body_height
         assert command == pytest.approx(expected)
     finally:
         loco.world.close()

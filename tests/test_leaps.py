@@ -94,7 +94,9 @@ def test_without_trenches_strides_are_the_usual_ones() -> None:
 
 def test_risk_of_a_foothold() -> None:
     trenches = np.array([[1.0, 1.3], [2.0, 2.2]])
-    risk = foothold_risk(np.array([0.5, 0.9, 0.96, 1.0, 1.15, 1.34, 2.1, 3.0]), trenches, clear=0.08)
+    risk = foothold_risk(
+        np.array([0.5, 0.9, 0.96, 1.0, 1.15, 1.34, 2.1, 3.0]), trenches, clear=0.08
+    )
     np.testing.assert_allclose(risk, [0.0, 0.0, 0.25, 1.0, 4.0, 0.25, 4.0, 0.0], atol=1e-9)
 
 

@@ -364,7 +364,7 @@ def test_the_script_shows_both_beside_each_other(tmp_path, capsys):
         (["--tune", "none.json"], "none.json: No such file or directory"),
         (
             ["--set", "decoder.vx.high=1.5"],
-            "decoder.vx.high=1.5: the low policy was trained on [-1.0, 1.0]",
+            "decoder.vx.high=1.5: the low policy was trained on [-1.0, 1.2]",
         ),
         (
             ["--tracking", "--set", "decision_rate=5"],
