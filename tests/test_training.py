@@ -402,6 +402,9 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         train_high.main([*arguments, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     )
     assert [row["steps"] for row in rows(whole)] == [16, 32]
+    # What imitation gave stays beside what came of it.
+    imitated, learned = (policies.load(whole / name) for name in ("imitation", "policy"))
+    assert (imitated.meta["steps"], learned.meta["steps"]) == (16, 40)
     # Half way from 2e-3 to 2e-4 in imitation; after 24 of 40 steps from 1.5e-4 to 5e-5.
     rates = [row["train/learning_rate"] for row in rows(whole)]
     assert rates == pytest.approx([1.1e-3, 5e-5 + 0.4 * 1e-4])

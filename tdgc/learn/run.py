@@ -160,7 +160,10 @@ class Run:
                 callback.tell_faults()
                 callback.save()
                 raise
-            return callback.save(), finished, callback.unsaved
+            taken = callback.save()
+            if finished and phase.until < self.config.steps and callback.unsaved is None:
+                callback.save_policy(phase.name)  # what this phase gave, beside what comes of it
+            return taken, finished, callback.unsaved
         finally:
             env.close()
 
@@ -239,17 +242,26 @@ class RunCallback(BaseCallback):
         states = self.env.state_dicts()
         extra = {"workers": states, "seconds": self.seconds, "phase": self._number}
         taken = Checkpoint.take(self.model, extra)
-        meta = {**self.run.meta, "steps": taken.steps, "seconds": round(self.seconds)}
-        folder = self.run.folder
         try:
             # The policy first: it is refused when it is not finite, and a checkpoint should be.
-            policies.save(folder / "policy", cast(ActorCriticPolicy, self.model.policy), meta)
-            taken.save(folder / "checkpoints")
+            self.save_policy("policy")
+            taken.save(self.run.folder / "checkpoints")
             self.unsaved = None
         except OSError as error:
             self.unsaved = error
             tqdm.write(f"no checkpoint at {taken.steps} steps, the one before stays: {error}")
         return taken
+
+    def save_policy(self, name: str) -> None:
+        """Write the policy as it stands, under ``name`` in the run's folder.
+
+        Raises:
+            ValueError: it is not finite.
+            OSError: it cannot be written.
+        """
+        progress = {"steps": self.model.num_timesteps, "seconds": round(self.seconds)}
+        policy = cast(ActorCriticPolicy, self.model.policy)
+        policies.save(self.run.folder / name, policy, {**self.run.meta, **progress})
 
     def _log(self) -> None:
         sums: dict[str, float] = {}
