@@ -58,28 +58,24 @@ SHIPPED_HIGH = PRETRAINED / "high"
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    add_arguments(parser, "runs/evaluation")
-    parser.add_argument(
+    groups = add_arguments(parser, "runs/evaluation")
+    groups.episodes.add_argument(
+        "--conditions", default="nominal", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
+    )
+    who = groups.policies
+    who.add_argument(
         "--policies",
         help="all, or of tdgc (the hierarchy), gp (the scripted baseline), cues (a script on the "
         "cues of tdgc) and teacher (the script that tdgc imitated first, which is told where "
         "everything is); all is tdgc and gp, the default where there is a high policy, shipped or "
         "given by --high, and otherwise gp",
     )
-    parser.add_argument(
-        "--conditions", default="nominal", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
+    who.add_argument(
+        "--low", type=Path, default=PRETRAINED / "low", help="low policy (the shipped one)"
     )
-    parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low policy")
-    parser.add_argument("--high", type=Path, help="high policy (the shipped one)")
-    parser.add_argument("--tracking", action="store_true", help="the low policy alone, on a plane")
-    parser.add_argument(
-        "--trace",
-        metavar="WHICH",
-        help="trace decisions and diagnose failures; write the traces of all episodes, of those "
-        "that failed, or of the first N of each cell: all, failed or N",
-    )
-    parser.add_argument("--tune", type=Path, metavar="FILE", help="tuning to compare with none")
-    parser.add_argument(
+    who.add_argument("--high", type=Path, help="high policy (the shipped one)")
+    who.add_argument("--tune", type=Path, metavar="FILE", help="tuning to compare with none")
+    who.add_argument(
         "--set",
         dest="assignments",
         metavar="KEY=VALUE",
@@ -87,7 +83,15 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         default=[],
         help="change the tuning, e.g. decoder.vx.high=0.6; may be repeated",
     )
-    parser.add_argument(
+    look = groups.looked_at.add_argument
+    look("--tracking", action="store_true", help="the low policy alone, on a plane")
+    look(
+        "--trace",
+        metavar="WHICH",
+        help="trace decisions and diagnose failures; write the traces of all episodes, of those "
+        "that failed, or of the first N of each cell: all, failed or N",
+    )
+    look(
         "--gui",
         nargs="?",
         const="drive",
@@ -95,7 +99,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         help="Bullet's window instead of a table, on the first tile of the first family and level: "
         "drive the low policy with sliders (drive), or watch the first policy decide (watch)",
     )
-    parser.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
+    groups.machine.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
     return parser.parse_args(arguments)
 
 

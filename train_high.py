@@ -198,14 +198,16 @@ def check(config: HighTrainConfig) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    add_arguments(parser, "runs/high")
-    parser.add_argument(
+    add_arguments(parser, "runs/high", HighTrainConfig())
+    high = parser.add_argument_group("high policy")
+    high.add_argument(
         "--low", help="low policy (what train_low.py left in runs/low, or else the shipped one)"
     )
-    parser.add_argument(
-        "--preset", choices=PRESETS, default="default", help="paper: the paper's hyperparameters"
-    )
-    parser.add_argument(
+    high.add_argument(
+        "--preset", choices=PRESETS, default="default",
+        help="paper: the paper's hyperparameters (default)",
+    )  # fmt: skip
+    high.add_argument(
         "--no-teacher", action="store_true", help="reinforcement learning alone, on any terrain"
     )
     args = parser.parse_args(arguments)

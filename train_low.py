@@ -160,7 +160,7 @@ def build(
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    add_arguments(parser, "runs/low")
+    add_arguments(parser, "runs/low", LowTrainConfig())
     args = parser.parse_args(arguments)
     try:
         config = configure(LowTrainConfig(), args)

@@ -324,17 +324,25 @@ def choose_workers(args: argparse.Namespace) -> int:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--robots", type=int, default=100)
-    parser.add_argument(
-        "--workers", type=workers_flag, default="auto", metavar="N", help="all of them (one a core)"
+    parser = argparse.ArgumentParser(
+        prog="python -m tdgc.bench", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--seconds", type=float, default=10.0, help="a measurement (10)")
+    parser.add_argument("--robots", type=int, default=100, help="number of robots (100)")
+    parser.add_argument(
+        "--workers",
+        type=workers_flag,
+        default="auto",
+        metavar="N",
+        help="processes of the measurements with all workers (one per core)",
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, help="per measurement (10)")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--load", action="store_true", help="compare robots, workers and threads")
     what.add_argument("--update", action="store_true", help="compare the high policy's updates")
     what.add_argument("--cluster", metavar="ADDRESS", help=f"compare: {CLUSTER_HELP}")
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/bench"), help="results folder (runs/bench)"
+    )
     args = parser.parse_args(arguments)
     try:
         args.workers = choose_workers(args)

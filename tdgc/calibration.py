@@ -347,13 +347,24 @@ def _walk(low: Policy, job: tuple[int, int]) -> tuple[Array, Array]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--low", type=Path, required=True, help="low policy, suffix or not")
-    parser.add_argument("--out", type=Path, required=True, help="where to write the copy, likewise")
-    parser.add_argument("--robots", type=int, default=4800, help="that walk to be measured (4800)")
-    parser.add_argument("--turns", type=int, default=60, help="of 60 control steps to learn (60)")
-    parser.add_argument("--workers", type=workers_flag, default="auto", metavar="N")
-    parser.add_argument("--seed", type=int, default=42)
+    parser = argparse.ArgumentParser(
+        prog="python -m tdgc.calibration", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument(
+        "--low", type=Path, required=True, help="low policy, with or without suffix"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="where to write the copy")
+    parser.add_argument(
+        "--robots", type=int, default=4800, help="number that walk and are measured (4800)"
+    )
+    parser.add_argument(
+        "--turns", type=int, default=60, help="of 60 control steps that the copy learns for (60)"
+    )
+    parser.add_argument(
+        "--workers", type=workers_flag, default="auto", metavar="N",
+        help="simulation processes (one per core)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=42, help="of all randomness (42)")
     args = parser.parse_args(arguments)
     try:
         for name, least in (("robots", 64), ("turns", 1), ("seed", 0)):

@@ -18,7 +18,9 @@ from tdgc.sim.geometry import read_geometry
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m tdgc.diagnose", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("log", type=Path, help=".npz or .csv, see docs/mujoco.md")
     parser.add_argument("--export", type=Path, required=True, help="folder that was on the robot")
     parser.add_argument(

@@ -208,16 +208,18 @@ def show(args: argparse.Namespace, config: "MujocoConfig") -> None:
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--export", type=Path, required=True, help="folder of tdgc.export")
-    flags.add_arguments(parser, "runs/mujoco")
-    parser.add_argument(
+    parser = argparse.ArgumentParser(
+        prog="python -m tdgc.mujoco", description=(__doc__ or "").splitlines()[0]
+    )
+    groups = flags.add_arguments(parser, "runs/mujoco")
+    groups.policies.add_argument("--export", type=Path, required=True, help="folder of tdgc.export")
+    groups.episodes.add_argument(
         "--armature", type=float, metavar="KG_M2", help="rotor inertia of each joint (0.01 kg m^2)"
     )
-    parser.add_argument(
+    groups.episodes.add_argument(
         "--joint-friction", type=float, metavar="NM", help="dry friction of each joint (0 N m)"
     )
-    parser.add_argument(
+    groups.episodes.add_argument(
         "--set",
         dest="assignments",
         metavar="KEY=VALUE",
@@ -225,16 +227,16 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         default=[],
         help="change MuJoCo's settings, e.g. solref=0.02; may be repeated",
     )
-    parser.add_argument(
+    groups.looked_at.add_argument(
         "--log",
         type=int,
         nargs="?",
         const=1,
         default=0,
         metavar="N",
-        help="logs of the first N episodes of each cell (1)",
+        help="logs of the first N episodes of each cell (none; 1 without N)",
     )
-    parser.add_argument(
+    groups.looked_at.add_argument(
         "--gui",
         action="store_true",
         help="MuJoCo's viewer instead of a table, on the first tile of the first family and level",

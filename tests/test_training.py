@@ -588,7 +588,7 @@ def test_flags_and_folders_that_cannot_be_used(
 def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as there are cores and robots for them; a run goes on with as many as it began."""
     parser = argparse.ArgumentParser()
-    add_arguments(parser, str(tmp_path))
+    add_arguments(parser, str(tmp_path), LowTrainConfig())
 
     def workers(*flags: str) -> int:
         return configure(LowTrainConfig(), parser.parse_args(flags)).workers

@@ -33,7 +33,9 @@ from tdgc.tasks.high_env import PRETRAINED, load_low
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m tdgc.ablate", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--only", metavar="NAMES", help="some of the variants (all)")
     parser.add_argument("--seeds", default="42", help="of the trainings, e.g. 42,43 (42)")
     parser.add_argument("--steps", type=int, help="decisions of a training (train_high.py's own)")
@@ -41,7 +43,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=100, help="of a family and level (100)")
     parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low policy (shipped)")
     parser.add_argument(
-        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
+        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one per core)"
     )
     parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds")
     parser.add_argument(

@@ -2,34 +2,54 @@
 
 import argparse
 from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
 
+Group: TypeAlias = argparse._ArgumentGroup
 
-def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
+
+class Groups(NamedTuple):
+    """Of an evaluation's flags, for those that are not in every evaluation."""
+
+    episodes: Group
+    policies: Group
+    looked_at: Group
+    machine: Group
+
+
+def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
     """Flags that ``read`` reads; ``out`` is where results go by default."""
-    parser.add_argument("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
-    parser.add_argument(
+    titles = "episodes", "policies", "what is looked at", "machine"
+    groups = Groups(*map(parser.add_argument_group, titles))
+    add = groups.episodes.add_argument
+    add("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
+    add(
         "--families",
         default="all",
-        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING}",
+        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING} (all)",
     )
-    parser.add_argument("--episodes", type=int, default=100, help="a cell (100)")
-    parser.add_argument(
+    add("--episodes", type=int, default=100, help="per cell (100)")
+    add("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
+    groups.looked_at.add_argument("--out", type=Path, default=Path(out), help=f"results ({out})")
+    groups.looked_at.add_argument(
         "--video",
         type=int,
         nargs="?",
         const=1,
         default=0,
         metavar="N",
-        help="films, sheets and strips of the first N episodes of each cell (1)",
+        help="films, sheets and strips of the first N episodes of each cell (none; 1 without N)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
-    parser.add_argument(
-        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one a core)"
+    groups.machine.add_argument(
+        "--workers",
+        type=workers_flag,
+        default="auto",
+        metavar="N",
+        help="simulation processes (one per core)",
     )
-    parser.add_argument("--out", type=Path, default=Path(out), help="results folder")
+    return groups
 
 
 def read(args: argparse.Namespace) -> None:

@@ -10,29 +10,35 @@ from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.worker import MakeLink, ProcessLink
 
 
-def add_arguments(parser: argparse.ArgumentParser, out: str) -> None:
-    """The flags of both trainers; ``out`` is the default run folder."""
-    parser.add_argument("--seed", type=int, help="of everything random (42)")
-    parser.add_argument("--n-envs", type=int, help="robots altogether")
-    parser.add_argument(
-        "--workers", type=workers_flag, metavar="N",
-        help="processes that simulate, or auto: one a core, each with 10 robots at least",
-    )  # fmt: skip
-    parser.add_argument(
-        "--worker-timeout", type=float, default=300.0, metavar="S",
-        help="start a worker anew that is silent for S seconds (300)",
-    )  # fmt: skip
-    parser.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
-    parser.add_argument("--steps", type=int, help="steps altogether")
-    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds")
-    parser.add_argument("--device", default="cpu", help="where the learner runs (cpu)")
-    parser.add_argument("--out", type=Path, default=Path(out), help=f"run folder ({out})")
-    parser.add_argument("--resume", action="store_true", help="go on with the run in --out")
-    parser.add_argument("--init", type=Path, help="start from this policy instead of anew")
-    parser.add_argument(
+def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config) -> None:
+    """The flags of both trainers; ``out`` is the default run folder, and ``config`` says what else
+    is default."""
+    default = to_dict(config)
+    training = parser.add_argument_group("training")
+    training.add_argument("--steps", type=int, help=f"steps altogether ({default['steps']})")
+    training.add_argument("--n-envs", type=int, help=f"number of robots ({default['n_envs']})")
+    training.add_argument("--seed", type=int, help=f"of all randomness ({default['seed']})")
+    training.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
-        help="change the configuration, e.g. ppo.n_steps=48",
+        help="change the configuration, e.g. ppo.n_steps=48; may be repeated",
     )  # fmt: skip
+    training.add_argument("--init", type=Path, help="start from this policy (from scratch)")
+    run = parser.add_argument_group("run")
+    run.add_argument("--out", type=Path, default=Path(out), help=f"run folder ({out})")
+    run.add_argument("--resume", action="store_true", help="continue the run in --out")
+    run.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds (never)")
+    machine = parser.add_argument_group("machine")
+    machine.add_argument(
+        "--workers", type=workers_flag, metavar="N",
+        help="simulation processes, or auto: one per core, with at least 10 robots each "
+        f"({default['workers']})",
+    )  # fmt: skip
+    machine.add_argument(
+        "--worker-timeout", type=float, default=300.0, metavar="S",
+        help="restart a worker that is silent for S seconds (300)",
+    )  # fmt: skip
+    machine.add_argument("--device", default="cpu", help="where the networks learn (cpu)")
+    machine.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
 
 
 def configure(config: Config, args: argparse.Namespace) -> Config:
