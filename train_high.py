@@ -21,7 +21,7 @@ from tqdm import tqdm
 from tdgc import __version__, policies
 from tdgc.config import NO_TEACHER, PRESETS, ConfigError, HighTrainConfig, to_dict
 from tdgc.learn.flags import add_arguments, configure, worker_link
-from tdgc.learn.imitation import Apprentice, ApprenticePolicy
+from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, shared_keywords
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise
 from tdgc.learn.run import Interruption, Phase, Run
@@ -46,6 +46,7 @@ from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.teacher import STYLES
 from tdgc.tasks.tiles import check_families
 
+_LED = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
 #: Where train_low.py leaves its policy by default.
 TRAINED_LOW = Path("runs/low/policy")
 
@@ -82,23 +83,23 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
 
 
 def make_env(
-    config: HighTrainConfig, low: Policy, guided: int, timeout: float, link: MakeLink
+    config: HighTrainConfig, low: Policy, taught: bool, led: float, timeout: float, link: MakeLink
 ) -> TaskVecEnv:
-    """The workers; ``guided`` as ``NavigationTask`` has it."""
+    """The workers; ``taught`` and ``led`` as ``NavigationTask`` has them."""
     env_config = config.env
     if config.imitation.steps:  # what was imitated on all levels goes on on all
         env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
     landing = None
-    if guided and "gap" in env_config.families:
+    if taught and "gap" in env_config.families:
         landing = measure_landing(*load_low(low))
         if landing is None:
             tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
     return TaskVecEnv(
-        functools.partial(NavigationTask, env_config, low, guided=guided, landing=landing),
+        functools.partial(NavigationTask, env_config, low, taught=taught, led=led, landing=landing),
         config.n_envs,
         config.workers,
         config.seed,
-        high_spaces(env_config, bool(guided)),
+        high_spaces(env_config, taught),
         recover=True,
         timeout=timeout,
         link=link,
@@ -145,7 +146,7 @@ def build_imitation(
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
     """Workers with a teacher, and the apprentice."""
     imitation = config.imitation
-    env = make_env(config, low, imitation.steps // config.n_envs, timeout, link)
+    env = make_env(config, low, True, _LED * (imitation.steps // config.n_envs), timeout, link)
     model = make_learner(
         Apprentice, ApprenticePolicy, env, config, device,
         learning_rate=LinearRate(imitation.learning_rate, imitation.final_learning_rate),
@@ -158,9 +159,17 @@ def build_imitation(
 def build_reinforcement(
     config: HighTrainConfig, low: Policy, device: str, timeout: float, link: MakeLink
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
-    """Workers and learner of reinforcement learning."""
-    env = make_env(config, low, 0, timeout, link)
-    return make_learner(FastRecurrentPPO, FastRecurrentPolicy, env, config, device), env
+    """Workers and learner of reinforcement learning, with a teacher if it goes on imitating."""
+    taught = bool(config.imitation.steps) and config.ppo.imitation_coef > 0.0
+    env = make_env(config, low, taught, 0.0, timeout, link)
+    model = make_learner(
+        FastRecurrentPPO, TaughtPolicy if taught else FastRecurrentPolicy, env, config, device
+    )
+    if taught:
+        # SB3 multiplies it by ``ent_coef``, with the entropy that it is a part of.
+        weight = config.ppo.imitation_coef / config.ppo.ent_coef
+        cast(TaughtPolicy, model.policy).imitation_weight = weight
+    return model, env
 
 
 def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
@@ -192,6 +201,11 @@ def check(config: HighTrainConfig) -> None:
         raise ConfigError(
             f"'ppo.gait_ent_coef' must be at least 0, and 0 without an ent_coef, not "
             f"{ppo.gait_ent_coef:g}"
+        )
+    if ppo.imitation_coef < 0.0 or (ppo.imitation_coef > 0.0 and not ppo.ent_coef > 0.0):
+        raise ConfigError(
+            f"'ppo.imitation_coef' must be at least 0, and 0 without an ent_coef, not "
+            f"{ppo.imitation_coef:g}"
         )
     CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
 

@@ -133,7 +133,7 @@ def test_baseline_holds_the_default_behaviour_parameters(low):
 def test_the_teacher_drives_as_it_teaches(low, family):
     """Its commands are those that the apprentice is shown, held for a decision."""
     config, landing = dataclasses.replace(CONFIG, families=(family,)), measure_landing(*low)
-    task = NavigationTask(config, LOW, 2, seed=4, training=False, guided=1, landing=landing)
+    task = NavigationTask(config, LOW, 2, seed=4, training=False, taught=True, landing=landing)
     try:
         task.reset(np.arange(2))
         executor, driver = Executor(task.locomotion, low[0]), TeacherDriver(*low)

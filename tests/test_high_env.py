@@ -224,7 +224,7 @@ def test_a_symmetric_policy_needs_the_same_bounds_to_both_sides():
 
 def test_the_teachers_episodes_move_no_levels():
     config = dataclasses.replace(CONFIG, window=2, threshold=2, first_levels=3)
-    task = NavigationTask(config, LOW, 10, seed=0, guided=100)
+    task = NavigationTask(config, LOW, 10, seed=0, taught=True, led=75)
     task.reset(np.arange(10))
     task.curriculum.push(np.arange(10), np.zeros(10, dtype=bool))
     task._led[:] = np.arange(10) < 5
@@ -405,7 +405,7 @@ def test_a_teacher_says_what_can_be_said_of_what_it_does():
     """Over trenches it pronks; who may only trot at fixed parameters is shown how fast and where
     to."""
     config = dataclasses.replace(CONFIG, families=("gap",), gaits=("trot",), behaviour="velocities")
-    task = NavigationTask(config, LOW, 2, seed=0, guided=8, landing=Landing())
+    task = NavigationTask(config, LOW, 2, seed=0, taught=True, led=6, landing=Landing())
     try:
         task.reset(np.arange(2))
         size = width(high_layout(CONFIG))
@@ -427,7 +427,7 @@ def test_robots_begin_spread_over_the_first_levels():
 
 def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
     config = dataclasses.replace(CONFIG, families=("stair", "gap"), episode_seconds=0.2)
-    task = NavigationTask(config, LOW, 40, seed=0, guided=8)
+    task = NavigationTask(config, LOW, 40, seed=0, taught=True, led=6)
     try:
         task.reset(np.arange(40))
         size = width(high_layout(CONFIG))
@@ -449,14 +449,14 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
         task.close()
 
 
-@pytest.mark.parametrize("guided", [0, 20])
+@pytest.mark.parametrize("taught", [False, True])
 @pytest.mark.parametrize("episodes", [True, False])
-def test_the_future_follows_from_the_state(episodes, guided):
+def test_the_future_follows_from_the_state(episodes, taught):
     """That of episodes under way after ``forget``, which then end on the way; that of new ones
     after ``restart``."""
     config = dataclasses.replace(CONFIG, families=("rough", "gap"), episode_seconds=0.8)
-    first = NavigationTask(config, LOW, 3, seed=1, guided=guided)
-    second = NavigationTask(config, LOW, 3, seed=1, guided=guided)
+    first = NavigationTask(config, LOW, 3, seed=1, taught=taught, led=15)
+    second = NavigationTask(config, LOW, 3, seed=1, taught=taught, led=15)
     try:
         first.reset(np.arange(3))
         rng = np.random.default_rng(0)

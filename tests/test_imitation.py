@@ -10,7 +10,14 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from tdgc import policies
-from tdgc.learn.imitation import Apprentice, ApprenticePolicy, expected_price, imitation_loss
+from tdgc.learn.imitation import (
+    Apprentice,
+    ApprenticePolicy,
+    TaughtPolicy,
+    expected_price,
+    imitation_loss,
+)
+from tdgc.learn.recurrent import FastRecurrentPPO
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
 from tdgc.tasks.high_env import GUIDANCE
 from tdgc.tasks.leaps import FREQUENCIES
@@ -41,40 +48,65 @@ class Lesson(gym.Env):
         return self._observe(), 0.1, False, bool(self.rng.random() < 0.05), {}
 
 
-@pytest.fixture
-def apprentice():
+@pytest.fixture(autouse=True)
+def one_thread():
     threads = th.get_num_threads()
     th.set_num_threads(1)
-    yield Apprentice(
-        ApprenticePolicy,
+    yield
+    th.set_num_threads(threads)
+
+
+def learner(kind: type[FastRecurrentPPO], policy: type[TaughtPolicy]) -> FastRecurrentPPO:
+    return kind(
+        policy,
         DummyVecEnv([lambda i=i: Lesson(i) for i in range(ENVS)]),
         n_steps=STEPS,
         batch_size=STEPS * ENVS,
         n_epochs=10,
         learning_rate=3e-3,
+        ent_coef=1e-3,
         seed=0,
         device="cpu",
         policy_kwargs={"lstm_hidden_size": 16, "net_arch": [16], "log_std_init": -2.0},
     )
-    th.set_num_threads(threads)
+
+
+@pytest.fixture
+def apprentice() -> FastRecurrentPPO:
+    return learner(Apprentice, ApprenticePolicy)
+
+
+def error(model: FastRecurrentPPO) -> float:
+    """Mean square of how far mean actions are from the teacher's, in the last rollout."""
+    batch = next(model.rollout_buffer.get(STEPS * ENVS))
+    obs = batch.observations
+    with th.no_grad():
+        mean, _ = model.policy.unroll(obs, batch.lstm_states, batch.episode_starts)
+    return float((mean - obs[:, SEEN : SEEN + NUM_ACTIONS]).square().mean())
 
 
 def test_an_apprentice_learns_what_it_is_taught_and_keeps_its_noise(apprentice) -> None:
     noise = apprentice.policy.log_std.clone()
 
-    def error() -> float:
-        batch = next(apprentice.rollout_buffer.get(STEPS * ENVS))
-        obs = batch.observations
-        with th.no_grad():
-            mean, _ = apprentice.policy.unroll(obs, batch.lstm_states, batch.episode_starts)
-        return float((mean - obs[:, SEEN : SEEN + NUM_ACTIONS]).square().mean())
-
     apprentice.learn(STEPS * ENVS)
-    first = error()
+    first = error(apprentice)
     apprentice.learn(40 * STEPS * ENVS)
     assert first > 0.03  # of labels with a variance of 0.083
-    assert error() < 0.15 * first
+    assert error(apprentice) < 0.15 * first
     assert th.equal(apprentice.policy.log_std, noise)
+
+
+def test_reinforcement_learning_goes_on_imitating_as_far_as_it_is_told_to() -> None:
+    """Every action earns the same, so PPO alone has no reason to do as the teacher does."""
+    errors = []
+    for weight in (0.0, 1e4):  # times the ent_coef
+        model = learner(FastRecurrentPPO, TaughtPolicy)
+        noise = model.policy.log_std.clone()
+        model.policy.imitation_weight = weight
+        model.learn(60 * STEPS * ENVS)
+        errors.append(error(model))
+        assert not th.equal(model.policy.log_std, noise)  # it explores as PPO wants it to
+    assert errors[0] > 0.07 and errors[1] < 0.03, errors
 
 
 def test_the_teachers_actions_are_not_seen(apprentice, tmp_path) -> None:

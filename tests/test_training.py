@@ -579,6 +579,7 @@ def test_flags_and_folders_that_cannot_be_used(
         ("env.gaits=[]", "gaits must be some of trot, pronk, pace, bound, each once, not []"),
         ("ppo.gait_hold=0", "'ppo.gait_hold' must be at least 1, not 0"),
         ("ppo.gait_ent_coef=-1", "'ppo.gait_ent_coef' must be at least 0, and 0 without an ent_"),
+        ("ppo.imitation_coef=-1", "'ppo.imitation_coef' must be at least 0, and 0 without an ent_"),
     ):
         assert train_high.main(["--set", setting, "--out", str(empty)]) == 2
         assert capsys.readouterr().err.startswith(f"train_high.py: {message}")

@@ -88,6 +88,8 @@ class RecurrentPPOConfig:
     gait_hold: int = field(default=1, metadata={"before": 1})
     # Bonus on the entropy of the gait alone, which falls linearly to nothing at the last step.
     gait_ent_coef: float = field(default=0.0, metadata={"before": 0.0})
+    # Weight of the imitation's loss beside PPO's, where imitation came first.
+    imitation_coef: float = field(default=0.0, metadata={"before": 0.0})
     # Units of both LSTMs; null for a feed-forward policy. With 128 units each an update takes twice
     # as long, and what is learned is no better.
     lstm: int | None = 64

@@ -27,15 +27,23 @@ _FREQUENCY = INDEX["frequency"]
 _PRICE_WEIGHT, _PRICED = 10.0, 0.1
 
 
-class ApprenticePolicy(FastRecurrentPolicy):
-    """``FastRecurrentPolicy`` on observations that the teacher's guidance follows, unseen."""
+class TaughtPolicy(FastRecurrentPolicy):
+    """``FastRecurrentPolicy`` on observations that the teacher's guidance follows, unseen.
+
+    Attributes:
+        imitation_weight: of ``imitation_loss`` against the entropy, in reinforcement learning.
+    """
 
     def __init__(self, observation_space: spaces.Box, *args: Any, **kwargs: Any) -> None:
         self.seen = observation_space.shape[0] - GUIDANCE
+        self.imitation_weight = 0.0
         own = spaces.Box(observation_space.low[: self.seen], observation_space.high[: self.seen])
-        # Gradients of squared errors of actions are below SB3's eps of 1e-5 in the end.
-        super().__init__(own, *args, optimizer_kwargs={"eps": 1e-8, "fused": True}, **kwargs)
-        self.log_std.requires_grad_(False)  # what exploration is to begin with
+        super().__init__(own, *args, **kwargs)
+
+    def bonus(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
+        limit = float(cast(spaces.Box, self.action_space).high[_FREQUENCY])
+        error = imitation_loss(mean, obs[..., self.seen :], limit)
+        return super().bonus(obs, mean) - self.imitation_weight * error
 
     def forward(self, obs: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         return super().forward(obs[..., : self.seen], *args, **kwargs)
@@ -48,6 +56,15 @@ class ApprenticePolicy(FastRecurrentPolicy):
 
     def unroll(self, obs: th.Tensor, *args: Any) -> tuple[th.Tensor, th.Tensor]:
         return super().unroll(obs[..., : self.seen], *args)
+
+
+class ApprenticePolicy(TaughtPolicy):
+    """A ``TaughtPolicy`` that learns nothing but what it is taught."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        # Gradients of squared errors of actions are below SB3's eps of 1e-5 in the end.
+        super().__init__(*args, optimizer_kwargs={"eps": 1e-8, "fused": True}, **kwargs)
+        self.log_std.requires_grad_(False)  # what exploration is to begin with
 
 
 def expected_price(frequency: th.Tensor, price: th.Tensor, limit: float) -> th.Tensor:

@@ -156,12 +156,16 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         """
         mean, values = self.unroll(obs, lstm_states, episode_starts)
         log_prob, entropy = gaussian(actions, mean, self.log_std)
-        if self.gait is not None and self.gait_bonus > 0.0:
-            limit = float(cast(spaces.Box, self.action_space).high[-1])
-            std = self.log_std[-1].exp()
-            gaits = gait_entropy(mean[:, -1], std, limit, self.gait.gaits)
-            entropy = entropy + self.gait_bonus * gaits
-        return values, log_prob, entropy
+        return values, log_prob, entropy + self.bonus(obs, mean)
+
+    def bonus(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
+        """What counts like the entropy of the mean actions ``mean`` (n, size) taken at ``obs``,
+        (n,)."""
+        if self.gait is None or self.gait_bonus <= 0.0:
+            return mean.new_zeros(len(mean))
+        limit = float(cast(spaces.Box, self.action_space).high[-1])
+        std = self.log_std[-1].exp()
+        return self.gait_bonus * gait_entropy(mean[:, -1], std, limit, self.gait.gaits)
 
     def unroll(
         self, obs: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor

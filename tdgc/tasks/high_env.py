@@ -56,7 +56,6 @@ PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
 GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
 #: Width of what a teacher adds to an observation.
 GUIDANCE = NUM_ACTIONS + FREQUENCIES
-_LED = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
 
 #: The semantic cue: one-hot over the families, and one place for "unknown".
 SEMANTIC = (*FAMILIES, "unknown")
@@ -124,10 +123,10 @@ def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
 
 
 def high_spaces(
-    config: HighLevelConfig, guided: bool = False
+    config: HighLevelConfig, taught: bool = False
 ) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     """Observations, with the teacher's guidance if there is one, and actions of the high policy."""
-    size = width(high_layout(config)) + guided * GUIDANCE
+    size = width(high_layout(config)) + taught * GUIDANCE
     limit = config.action_limit
     seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
     return seen, gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
@@ -261,10 +260,11 @@ class NavigationTask:
         seed: of everything random here.
         training: draw disturbances and let the curriculum move levels.
         visual: keep what pictures of the ground need.
-        guided: decisions of each robot in which a teacher helps, see ``tdgc.learn.imitation``. Its
-            guidance follows the observation: its actions, and the prices of step frequencies from
-            the least to the greatest action, see ``Teacher.price``. It drives a share of the
-            episodes that falls from all to none over the first ``_LED`` of these decisions.
+        taught: a teacher's guidance follows the observation, see ``tdgc.learn.imitation``: its
+            actions, and the prices of step frequencies from the least to the greatest action, see
+            ``Teacher.price``.
+        led: decisions of each robot over which the share of the episodes that the teacher drives
+            falls from all to none.
         landing: of the low policy, for the teacher.
     """
 
@@ -276,7 +276,8 @@ class NavigationTask:
         seed: int,
         training: bool = True,
         visual: bool = False,
-        guided: int = 0,
+        taught: bool = False,
+        led: float = 0.0,
         landing: Landing | None = None,
     ) -> None:
         self.low, self.low_config = load_low(low)
@@ -312,11 +313,11 @@ class NavigationTask:
         self.stats: dict[str, float] = {}
         families = [config.families[f] for f in self.family]
         ranges = config.commands or CommandRanges()
-        self.teacher = Teacher(self.field, families, ranges, landing) if guided else None
-        self._guided, self._decisions = guided, np.zeros(1, dtype=np.int64)
+        self.teacher = Teacher(self.field, families, ranges, landing) if taught else None
+        self._lead, self._decisions = led, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
-        self.observation_space, self.action_space = high_spaces(config, bool(guided))
+        self.observation_space, self.action_space = high_spaces(config, taught)
 
     def _build_robots(self) -> None:
         self.tiles.draw(np.arange(self.num_robots), self.curriculum.levels)
@@ -353,7 +354,7 @@ class NavigationTask:
         self._probes.begin(index)
         if self.teacher is not None:
             self.teacher.begin(index, self.goal)
-            share = 1.0 - self._decisions[0] / (_LED * self._guided)
+            share = 1.0 - self._decisions[0] / self._lead if self._lead else 0.0
             self._led[index] = rng.uniform(size=n) < share
 
     def _width(self) -> Array:
