@@ -197,16 +197,12 @@ def check(config: HighTrainConfig) -> None:
         raise ConfigError(f"'env.unknown_share' must be from 0 to 1, not {unknown:g}")
     if ppo.gait_hold < 1:
         raise ConfigError(f"'ppo.gait_hold' must be at least 1, not {ppo.gait_hold}")
-    if ppo.gait_ent_coef < 0.0 or (ppo.gait_ent_coef > 0.0 and not ppo.ent_coef > 0.0):
-        raise ConfigError(
-            f"'ppo.gait_ent_coef' must be at least 0, and 0 without an ent_coef, not "
-            f"{ppo.gait_ent_coef:g}"
-        )
-    if ppo.imitation_coef < 0.0 or (ppo.imitation_coef > 0.0 and not ppo.ent_coef > 0.0):
-        raise ConfigError(
-            f"'ppo.imitation_coef' must be at least 0, and 0 without an ent_coef, not "
-            f"{ppo.imitation_coef:g}"
-        )
+    for name in ("gait_ent_coef", "imitation_coef"):  # SB3 multiplies what they weigh by ent_coef
+        weight = getattr(ppo, name)
+        if weight < 0.0 or (weight > 0.0 and not ppo.ent_coef > 0.0):
+            raise ConfigError(
+                f"'ppo.{name}' must be at least 0, and 0 without an ent_coef, not {weight:g}"
+            )
     CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
 
 
