@@ -124,7 +124,7 @@ class HighTrainConfig:
     seed: int = 42
     n_envs: int = 100
     workers: int = 2
-    steps: int = 1_600_000  # decisions altogether: less than an hour of two cores
+    steps: int = 2_100_000  # decisions altogether: an hour of two cores
     log_steps: int = 24_000
     checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
     start_speed: float = 0.5  # m/s: before any training it walks straight on in the default gait
