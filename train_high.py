@@ -146,7 +146,9 @@ def build_imitation(
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
     """Workers with a teacher, and the apprentice."""
     imitation = config.imitation
-    env = make_env(config, low, True, _LED * (imitation.steps // config.n_envs), timeout, link)
+    mdp = dataclasses.replace(config.env, curriculum=imitation.curriculum)
+    shown, led = dataclasses.replace(config, env=mdp), _LED * (imitation.steps // config.n_envs)
+    env = make_env(shown, low, True, led, timeout, link)
     model = make_learner(
         Apprentice, ApprenticePolicy, env, config, device,
         learning_rate=LinearRate(imitation.learning_rate, imitation.final_learning_rate),

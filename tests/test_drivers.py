@@ -213,7 +213,8 @@ def test_mixed_terrain_is_unknown_to_the_high_level(low, tmp_path):
         def expected(index: int) -> Array:
             zero, families = np.zeros((1, NUM_ACTIONS)), np.array([index])
             probes = height_probes(loco, PROBES["lines"])
-            seen = Seen(loco, goal, np.zeros(1), zero, families, probes, np.zeros(1))
+            nothing = np.zeros(1)
+            seen = Seen(loco, goal, nothing, zero, families, probes, nothing, nothing)
             action, _ = high.predict(observe(high_layout(config), seen))
             return CommandDecoder(config.commands).decode(action)
 
@@ -261,7 +262,7 @@ def test_files_that_are_no_high_level_are_refused(low, tmp_path):
     with pytest.raises(ConfigError, match=r"high: its meta lacks what it was trained on$"):
         load_high(path, *low)
     path = save_high(tmp_path / "high", low, size=80)
-    with pytest.raises(ConfigError, match=r"high policy that observes 91 values, not 80$"):
+    with pytest.raises(ConfigError, match=r"high policy that observes 92 values, not 80$"):
         load_high(path, *low)
     with pytest.raises(policies.PolicyFileError, match=r"none.json: no such file$"):
         load_high(tmp_path / "none", *low)

@@ -238,11 +238,15 @@ def test_high_level_is_the_tasks_observation_and_decoder(
         memory = rng.normal(0.0, 0.5, (2, 5, policy.state_size)).astype(np.float32)
         elapsed = np.arange(5) * 17
         heights, late = height_probes(loco, PROBES[probes]), np.arange(5) % 2
+        before = rng.uniform(3.0, 5.0, (5, 2))  # the first robot is at its first decision
+        before[0] = 0.0
+        distance = np.linalg.norm(task.goal - loco.world.state.position[:, :2], axis=1)
+        closing = (np.linalg.norm(before, axis=1) - distance) / 0.08 * (np.arange(5) > 0)
         seen = observe(
             high_layout(config),
             Seen(
                 loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
-                task.family_index, heights, late,
+                task.family_index, heights, late, closing,
             ),
         )  # fmt: skip
         wanted, (hidden, cell) = policy.predict(seen, (memory[:1], memory[1:]))
@@ -262,6 +266,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(
                     "family": np.eye(6)[task.family_index[k]],
                     "probes": np.where(np.abs(heights[k]) < 0.5, 1.0, 3.0) * heights[k],
                     "probe_age": 0.08 * late[k : k + 1],
+                    "last_goal": before[k],
                     "hidden": memory[0, k],
                     "cell": memory[1, k],
                 },
@@ -582,7 +587,7 @@ def save_pairs(path: Path) -> None:
         ("--high {low}", "low: not a high policy"),
         ("--high {0}/fast", "commands.vx asks for [-1.0, 1.5], but the low policy was trained on"),
         ("--high {0}/slow", "trained for a low policy with a control step of 0.01 s, not 0.02"),
-        ("--high {0}/blind", "trained for a high policy that observes 52 values, not 91"),
+        ("--high {0}/blind", "trained for a high policy that observes 53 values, not 92"),
         ("--high {0}/high --low {0}/dizzy", "dizzy: its configuration gives "),
         ("--high {0}/forward", "forward: only a recurrent high policy can be exported"),
         ("--high {0}/high --out {0}/file/out", "Not a directory"),

@@ -173,10 +173,22 @@ def test_layout_and_cues():
         cues: width(high_layout(dataclasses.replace(CONFIG, cues=cues)))
         for cues in ("none", "semantic", "geometric", "both")
     }
-    assert sizes == {"none": 52, "semantic": 58, "geometric": 85, "both": 91}
-    assert width(high_layout(dataclasses.replace(CONFIG, clock="sine"))) == 87
-    assert width(high_layout(dataclasses.replace(CONFIG, probe_age=False))) == 90
+    assert sizes == {"none": 53, "semantic": 59, "geometric": 86, "both": 92}
+    assert width(high_layout(dataclasses.replace(CONFIG, clock="sine"))) == 88
+    assert width(high_layout(dataclasses.replace(CONFIG, probe_age=False))) == 91
+    assert width(high_layout(dataclasses.replace(CONFIG, closing_speed=False))) == 91
     assert SEMANTIC[-1] == "unknown"
+
+
+def test_sees_how_fast_the_goal_comes_nearer(task):
+    column = width(high_layout(CONFIG)) - 1
+    assert (task.observe()[:, column] == 0.0).all()
+    world, away = task.locomotion.world, task.goal - task.locomotion.world.state.position[:, :2]
+    world.state.position[:, :2] += 0.12 * away / np.linalg.norm(away, axis=1)[:, None]
+    task._approach.measure(task.goal)
+    assert task.observe()[:, column] == pytest.approx(np.full(5, 1.2), abs=1e-6)
+    task.reset(np.array([1, 3]))
+    assert (task.observe()[:, column] != 0.0).tolist() == [True, False, True, False, True]
 
 
 @pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])

@@ -10,7 +10,7 @@ from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.terrain import Features, TileField, make_tile
 from tdgc.tasks.leaps import SWING_HEIGHT, Landing
-from tdgc.tasks.teacher import PLAIN, STYLES, Teacher, travel_cost
+from tdgc.tasks.teacher import SIGHT, STYLES, UNEVEN, Teacher, travel_cost
 
 
 def test_travel_cost_in_the_open_is_the_way_of_a_king() -> None:
@@ -143,8 +143,8 @@ def test_a_family_without_a_style_is_walked_straight_on(course) -> None:
     course = course(["mixed"])
     course.put(1.0)
     command = course.commands()[0]
-    assert command[INDEX["vx"]] == pytest.approx(PLAIN.speed) and gait_index(command) == 0
-    assert command[INDEX["swing_height"]] == PLAIN.swing_height
+    assert command[INDEX["vx"]] == pytest.approx(UNEVEN.speed) and gait_index(command) == 0
+    assert command[INDEX["swing_height"]] == UNEVEN.swing_height
 
 
 def test_a_policy_that_does_not_leap_walks_over_trenches(course) -> None:
@@ -153,4 +153,21 @@ def test_a_policy_that_does_not_leap_walks_over_trenches(course) -> None:
     course.teacher.begin(np.arange(1), course.goal)
     course.put(1.7)
     command = course.commands()[0]
-    assert command[INDEX["vx"]] == pytest.approx(PLAIN.speed) and gait_index(command) == 0
+    assert command[INDEX["vx"]] == pytest.approx(UNEVEN.speed) and gait_index(command) == 0
+
+
+def test_who_is_not_told_of_trenches_leaps_when_it_sees_one(course) -> None:
+    course = course(["gap", "gap"])
+    told = np.array([True, False])
+    course.teacher = Teacher(course.field, ["gap", "gap"], CommandRanges(), Landing(), told)
+    course.field.features[1, 0] = course.field.features[0, 0]
+    course.teacher.begin(np.arange(2), course.goal)
+    lip = course.field.features[0, 0].trenches[0, 0]
+    course.put(lip - SIGHT - 0.05)
+    leaps, walks = course.commands()
+    assert gait_index(leaps) == 1 and gait_index(walks) == 0
+    assert walks[INDEX["swing_height"]] == UNEVEN.swing_height
+    assert walks[INDEX["vx"]] == pytest.approx(UNEVEN.speed, abs=1e-3)
+    course.put(lip - SIGHT + 0.05)
+    leaps, sees = course.commands()
+    assert gait_index(leaps) == gait_index(sees) == 1

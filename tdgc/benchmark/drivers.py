@@ -23,6 +23,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
+from tdgc.tasks.approach import Approach
 from tdgc.tasks.high_env import SEMANTIC, Seen, high_layout, paired
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.probes import PROBES, HeightProbes
@@ -167,9 +168,9 @@ class HierarchyDriver(Driver):
         if config.cues in ("both", "semantic"):
             self.told = SEMANTIC[seen]
         self._sensor = HeightProbes(loco, PROBES[config.probes], noise)
-        self._horizon = round(
-            config.episode_seconds / (config.decimation * loco.physics.control_dt)
-        )
+        seconds = config.decimation * loco.physics.control_dt
+        self._approach = Approach(loco, seconds)
+        self._horizon = round(config.episode_seconds / seconds)
         self._state: Any = None
         self._last = np.zeros((m, NUM_ACTIONS))
 
@@ -187,14 +188,23 @@ class HierarchyDriver(Driver):
         rows = np.arange(self._loco.num_robots)
         if decision == 0:
             self._sensor.begin(rows)
+            self._approach.begin(rows, self._goal)
         else:
             self._sensor.measure()
+            self._approach.measure(self._goal)
         probes = self._sensor.read()
         if self.config.cues in ("both", "geometric"):
             self.probes = probes
         share = np.full(len(rows), decision / self._horizon)
         seen = Seen(
-            self._loco, self._goal, share, self._last, self._families, probes, self._sensor.late
+            self._loco,
+            self._goal,
+            share,
+            self._last,
+            self._families,
+            probes,
+            self._sensor.late,
+            self._approach.speed,
         )
         return observe(high_layout(self.config), seen)
 

@@ -89,7 +89,7 @@ class RecurrentPPOConfig:
     # Bonus on the entropy of the gait alone, which falls linearly to nothing at the last step.
     gait_ent_coef: float = field(default=0.0, metadata={"before": 0.0})
     # Weight of the imitation's loss beside PPO's, where imitation came first.
-    imitation_coef: float = field(default=0.0, metadata={"before": 0.0})
+    imitation_coef: float = field(default=10.0, metadata={"before": 0.0})
     # Units of both LSTMs; null for a feed-forward policy. With 128 units each an update takes twice
     # as long, and what is learned is no better.
     lstm: int | None = 64
@@ -110,6 +110,11 @@ class ImitationConfig:
     # (docs/experiments.md). An update takes a tenth of the time of the decisions behind it.
     n_epochs: int = 16
     minibatches: int = field(default=8, metadata={"before": 4})
+    # How levels are chosen meanwhile, as ``env.curriculum`` has it afterwards: what the teacher
+    # shows needs no easy beginning, and the hardest levels are where a student has most to learn.
+    curriculum: Literal["performance", "uniform", "hardest"] = field(
+        default="uniform", metadata={"before": "performance"}
+    )
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,7 @@ class HighTrainConfig:
     seed: int = 42
     n_envs: int = 100
     workers: int = 2
-    steps: int = 1_600_000  # decisions altogether: less than an hour of two cores
+    steps: int = 2_100_000  # decisions altogether: an hour of two cores
     log_steps: int = 24_000
     checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
     start_speed: float = 0.5  # m/s: before any training it walks straight on in the default gait

@@ -350,6 +350,15 @@ class HighGraph(nn.Module):
             "family": Signal("family", len(SEMANTIC), "1", family, "families"),
             "probes": Signal("probes", NUM_PROBES, "m", probes, "probes"),
             "probe_age": Signal("probe_age", 1, "s", "since the probes were measured"),
+            "closing_speed": Signal(
+                "last_goal",
+                2,
+                "m",
+                "the goal at the last decision; 0 at the first",
+                None,
+                "goal",
+                0.0,
+            ),
         }
         self.inputs = [
             Signal("goal", 2, "m", "ahead and to the left in the frame that turns by yaw alone"),
@@ -395,6 +404,10 @@ class HighGraph(nn.Module):
             terms["probes"] = x["probes"].clamp(-PROBE_RANGE, PROBE_RANGE)
         if "probe_age" in x:
             terms["probe_age"] = x["probe_age"] / self.step
+        if "last_goal" in x:
+            before = (x["last_goal"] * x["last_goal"]).sum(0, keepdim=True).sqrt()
+            closing = (before - distance) / self.step
+            terms["closing_speed"] = th.where(before > 0.0, closing, th.zeros_like(closing))
         state = (x["hidden"].float()[None], x["cell"].float()[None])
         latent, (hidden, cell) = self.remember(self.row(terms)[None], state)
         decision = self.actor(latent).double()

@@ -40,6 +40,7 @@ from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import FAMILIES, draw_start_goal
 from tdgc.state import State, copies, fill
 from tdgc.tasks import rewards
+from tdgc.tasks.approach import Approach
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.leaps import FREQUENCIES, Landing
@@ -72,6 +73,7 @@ class Seen(NamedTuple):
         families: (M,) index into ``SEMANTIC``.
         probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
         late: (M,) how many decisions ago those were measured.
+        closing: (M,) m/s, how fast the goal came nearer since the last decision.
     """
 
     loco: Locomotion
@@ -81,6 +83,7 @@ class Seen(NamedTuple):
     families: NDArray[np.int64]
     probes: Array
     late: NDArray[Any]
+    closing: Array
 
 
 def _goal(seen: Seen) -> Array:
@@ -108,6 +111,7 @@ _LAYOUT: tuple[Term[Seen], ...] = (
 _COSINE: Term[Seen] = Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), mirror=LEGS)
 _PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
 _AGE: Term[Seen] = Term("probe_age", 1, lambda s: s.late[:, None].astype(np.float64))
+_CLOSING: Term[Seen] = Term("closing_speed", 1, lambda s: s.closing[:, None])
 _CUES: dict[str, Term[Seen]] = {
     "semantic": Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
     "geometric": Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
@@ -119,7 +123,8 @@ def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
     clock = (_COSINE,) if config.clock == "both" else ()
     cues = [term for cue, term in _CUES.items() if config.cues in ("both", cue)]
     age = (_AGE,) if config.probe_age and config.cues in ("both", "geometric") else ()
-    return (*_LAYOUT, *clock, *cues, *age)
+    closing = (_CLOSING,) if config.closing_speed else ()
+    return (*_LAYOUT, *clock, *cues, *age, *closing)
 
 
 def high_spaces(
@@ -313,7 +318,8 @@ class NavigationTask:
         self.stats: dict[str, float] = {}
         families = [config.families[f] for f in self.family]
         ranges = config.commands or CommandRanges()
-        self.teacher = Teacher(self.field, families, ranges, landing) if taught else None
+        told = self.family_index != SEMANTIC.index("unknown")
+        self.teacher = Teacher(self.field, families, ranges, landing, told) if taught else None
         self._lead, self._decisions = led, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
@@ -326,6 +332,7 @@ class NavigationTask:
         self.locomotion = Locomotion(m, c.robot, c.physics, self.field, c.gyro, self._visual)
         self._executor = Executor(self.locomotion, self.low, noise)
         self._probes = HeightProbes(self.locomotion, PROBES[self.config.probes], noise)
+        self._approach = Approach(self.locomotion, self.step_seconds)
 
     # ------------------------------------------------------------------ episodes
 
@@ -352,6 +359,7 @@ class NavigationTask:
             index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
         )
         self._probes.begin(index)
+        self._approach.begin(index, self.goal)
         if self.teacher is not None:
             self.teacher.begin(index, self.goal)
             share = 1.0 - self._decisions[0] / self._lead if self._lead else 0.0
@@ -397,6 +405,7 @@ class NavigationTask:
             now = np.column_stack([state.trunk_force, state.leg_force])
             np.maximum(force, now, out=force)
         self._probes.measure()
+        self._approach.measure(self.goal)
         if self.teacher is not None:
             self.teacher.watch(loco, self.step_seconds)
         self.elapsed += 1
@@ -437,6 +446,7 @@ class NavigationTask:
                 self.family_index,
                 self._probes.read(),
                 self._probes.late,
+                self._approach.speed,
             ),
         )
         if self.teacher is None:
@@ -515,6 +525,8 @@ class NavigationTask:
             "led": self._led,
             "probes": self._probes.measured,
             "late": self._probes.late,
+            "goal_distance": self._approach.distance,
+            "closing_speed": self._approach.speed,
             "taught": self._taught,
         }
 

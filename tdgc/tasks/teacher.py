@@ -65,25 +65,28 @@ class Style:
         return command
 
 
+#: On steps and bumps, and in families that have no style of their own.
+UNEVEN = Style(
+    0.6,
+    frequency=2.3,
+    swing_height=0.24,
+    stance_width=0.32,
+    body_height=0.05,
+    duration=0.55,
+    pitch=-0.07,
+)
 #: A family's style. Numbers beside the defaults of Walk These Ways are from docs/experiments.md.
 STYLES = {
-    "rough": Style(0.6, swing_height=0.2, stance_width=0.32),
+    "rough": UNEVEN,
     "pillar": Style(0.5),
-    "stair": Style(
-        0.5,
-        frequency=2.2,
-        swing_height=0.24,
-        stance_width=0.27,
-        body_height=0.05,
-        duration=0.55,
-        pitch=-0.07,
-    ),
+    "stair": UNEVEN,
     # in pronk, see ``tdgc.tasks.leaps``
     "gap": Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1),
     "tilt": Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45),
 }
-#: Of families that have none: straight on with high feet, as ``gp`` walks.
-PLAIN = Style(0.6, swing_height=0.2)
+
+#: m ahead that the probes see a trench; they reach 1.05 m.
+SIGHT = 1.0
 
 # The way around pillars follows a field of travel costs on every second sample of the tile.
 _COARSE = 2
@@ -148,6 +151,8 @@ class Teacher:
         families: of the robots, (M,) names.
         ranges: of the commands that their low policy was trained on.
         landing: of the low policy; None for one that does not leap, which walks over trenches.
+        told: (M,) whether a robot's high policy is told its family, by default all of them. One
+            that is not sees flat ground at first, like any other, and leaps when it sees a trench.
 
     Attributes:
         speed: (M,) m/s ahead, as leaps should have it by now and as it was seen.
@@ -161,21 +166,24 @@ class Teacher:
         families: Sequence[str],
         ranges: CommandRanges,
         landing: Landing | None,
+        told: NDArray[np.bool_] | None = None,
     ) -> None:
         m = len(families)
+        self._told = np.ones(m, dtype=bool) if told is None else told
         self._field, self._ranges, self._landing = field, ranges, landing
         self._origin = field.origin(np.arange(m), 0)
         self._leaps = np.array([family == "gap" and landing is not None for family in families])
         self._pillars = np.array([family == "pillar" for family in families])
         styles = [
-            PLAIN if family == "gap" and landing is None else STYLES.get(family, PLAIN)
+            UNEVEN if family == "gap" and landing is None else STYLES.get(family, UNEVEN)
             for family in families
         ]
-        self._command = np.array([style.command() for style in styles])
+        commands = np.array([style.command() for style in [*styles, UNEVEN]])
         # A low policy may have been trained on less than the styles ask for.
         bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
-        behaviour = self._command[:, : len(CONTINUOUS)]
+        behaviour = commands[:, : len(CONTINUOUS)]
         np.clip(behaviour, bounds[:, 0], bounds[:, 1], out=behaviour)
+        self._command, self._uneven = commands[:-1], commands[-1]
         self.speed = np.zeros(m)
         self.price = np.zeros((m, FREQUENCIES))
         self._top_speed = np.array([style.speed for style in styles])
@@ -183,6 +191,7 @@ class Teacher:
         self._climb = np.zeros(m)  # m/s to the left of the tile's length
         self._plan = LeapPlan(m, ranges)
         self._leap_speed = min(SPEED, ranges.vx[1])
+        self._start = np.full(m, -np.inf)  # m, x where a robot begins to leap
         self._end = np.full(m, -np.inf)  # m, x where a robot has no more to leap over
         self._fields: dict[int, tuple[Array, float, float]] = {}
 
@@ -196,6 +205,7 @@ class Teacher:
             trenches = self._field.features[int(i), 0].trenches
             assert self._landing is not None  # or nobody leaps
             self._plan.look(int(i), trenches, self._landing.spread)
+            self._start[i] = -np.inf if self._told[i] else trenches[0, 0] - SIGHT
             self._end[i] = trenches[-1, 1] + BEYOND
         for i in index[self._pillars[index]]:
             pillars, target = self._field.features[int(i), 0].pillars, goal[i] - self._origin[i]
@@ -217,10 +227,12 @@ class Teacher:
             if distance[i] > LOOK:
                 bearing[i] = _downhill(field, local[i], bearing[i])
         error = wrap_angle(bearing - state.yaw)
-        command = self._command.copy()
-        speed, turn = toward(distance, error, self._top_speed, turns=self._ranges.yaw_rate)
+        blind = local[:, 0] < self._start
+        command = np.where(blind[:, None], self._uneven, self._command)
+        top_speed = np.where(blind, UNEVEN.speed, self._top_speed)
+        speed, turn = toward(distance, error, top_speed, turns=self._ranges.yaw_rate)
         # Between pillars any way it faces: backward, too, off one that it leans on.
-        any_way = np.where(self._pillars, np.minimum(self._top_speed, distance), 0.0)
+        any_way = np.where(self._pillars, np.minimum(top_speed, distance), 0.0)
         speed = np.where(self._pillars, any_way * np.cos(error), speed)
         command[:, INDEX["vx"]] = speed + self._climb * np.sin(state.yaw)
         command[:, INDEX["vy"]] = any_way * np.sin(error) + self._climb * np.cos(state.yaw)
@@ -229,7 +241,7 @@ class Teacher:
             column = command[:, INDEX[name]]
             np.clip(column, *getattr(self._ranges, name), out=column)
         self.price[:] = 0.0
-        rows = np.flatnonzero(self._leaps & (local[:, 0] < self._end))
+        rows = np.flatnonzero(self._leaps & ~blind & (local[:, 0] < self._end))
         if rows.size and self._landing is not None:
             leaps = command[rows]
             steer_leap(leaps, bearing[rows], state.yaw[rows], self._ranges)
