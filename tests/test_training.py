@@ -147,7 +147,8 @@ def listed(path: Path) -> None:
 
 def newer(path: Path) -> None:
     header = json.loads((path / "state.json").read_text(encoding="utf-8"))
-    (path / "state.json").write_text(json.dumps({**header, "version": 4}), encoding="utf-8")
+    newer = header["version"] + 1
+    (path / "state.json").write_text(json.dumps({**header, "version": newer}), encoding="utf-8")
 
 
 def later(path: Path) -> None:

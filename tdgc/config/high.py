@@ -62,7 +62,7 @@ class HighLevelConfig:
     # Whether it is told how old the probes' heights are, as a sensor's time stamp does.
     probe_age: bool = field(default=True, metadata={"before": False})
     # Whether it sees how fast the goal came nearer since the last decision. A leap is timed by the
-    # trunk's speed, and the difference of two distances is hard to learn (docs/experiments.md).
+    # trunk's speed, which no sensor of the robot gives (docs/experiments.md).
     closing_speed: bool = field(default=True, metadata={"before": False})
     # Share of the robots in training that are told an unknown family, so that the probes alone have
     # to do: tiles of several families, or of none that has a name.
