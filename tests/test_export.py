@@ -19,7 +19,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
 from tdgc.deploy.controller import FORMATS, Graph
-from tdgc.deploy.graphs import HighGraph, LowGraph, clock_signal
+from tdgc.deploy.graphs import HighGraph, LowGraph, by_command, foot_phases
 from tdgc.deploy.interface import ExportError
 from tdgc.export import TOLERANCE
 from tdgc.learn.recurrent import FastRecurrentPolicy
@@ -306,7 +306,7 @@ def test_a_fixed_set_of_gaits_is_decoded_as_the_decoder_does(tmp_path: Path) -> 
     assert len(np.unique(wanted[:, 12:], axis=0)) == 3
 
 
-def test_clock_signal_is_the_phase_clocks() -> None:
+def test_foot_phases_are_the_phase_clocks() -> None:
     rng = np.random.default_rng(4)
     commands = random_commands(rng, 200)
     clock = rng.uniform(size=200)
@@ -315,8 +315,8 @@ def test_clock_signal_is_the_phase_clocks() -> None:
     phases.reset(np.arange(200), clock)
     phases.update(commands[:, 12:], commands[:, 5])
     for k, wanted in enumerate(phases.signal()):
-        got = clock_signal(th.tensor(clock[k : k + 1]), th.tensor(commands[k]))
-        assert got.numpy() == pytest.approx(wanted, abs=1e-14)
+        got = foot_phases(th.tensor(clock[k : k + 1]), by_command(th.tensor(commands[k])))
+        assert np.sin(2.0 * np.pi * got.numpy()) == pytest.approx(wanted, abs=1e-14)
 
 
 def test_goal_under_the_robot_counts_as_ahead(high: Path) -> None:
@@ -549,6 +549,7 @@ def test_command_writes_checks_and_reports(
     assert said.err == "" and said.out.count("\n") == 1
     assert said.out.startswith("torchscript: largest difference ")
     assert " in 50 control steps; a step takes " in said.out
+    assert " right after the one before" in said.out
     monkeypatch.setattr(export, "TOLERANCE", -1.0)
     assert export.main(arguments) == 1
     said = capsys.readouterr()

@@ -14,7 +14,7 @@ import torch as th
 import evaluate
 import train_low
 from tdgc.config import ConfigError, LowLevelConfig, PhysicsConfig, RobotConfig
-from tdgc.deploy.graphs import Pose
+from tdgc.deploy import graphs
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import PhaseClock, foot_phases, swing_profile
 from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
@@ -364,10 +364,12 @@ def test_commanded_and_exported_pose_of_another_robot(robot: RobotConfig) -> Non
     walking = walking_pose(robot, geometry, command, now, ahead, np.ones(20))
     assert np.abs(walking - pose).max() > 0.1  # the weight of 15 kg on stiffer joints
     for gait, wanted in ((False, pose), (True, walking)):
-        graph = Pose(dataclasses.replace(robot, commanded_gait=gait), 0.02)
+        graph = graphs.Pose(dataclasses.replace(robot, commanded_gait=gait), 0.02)
         for k in range(20):
-            given = th.from_numpy(clock.clock[k : k + 1]), th.ones(()), th.from_numpy(command[k])
-            np.testing.assert_allclose(graph(*given).numpy(), wanted[k], atol=1e-6)
+            told = graphs.by_command(th.from_numpy(command[k]))
+            times = clock.clock[k] + graph.ahead * told["frequency"]
+            found = graph(graphs.foot_phases(times, told), th.ones(()), told)
+            np.testing.assert_allclose(found.numpy(), wanted[k], atol=1e-6)
 
 
 def test_rewards_know_another_robots_limits(robot: RobotConfig) -> None:

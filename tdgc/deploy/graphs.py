@@ -19,6 +19,7 @@ from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig
 from tdgc.policies import Policy
 from tdgc.sim.commands import (
     INDEX,
+    NAMES,
     NUM_ACTIONS,
     NUM_COMMANDS,
     CommandDecoder,
@@ -48,18 +49,20 @@ def _constant(value: ArrayLike) -> Tensor:
     return th.tensor(np.asarray(value, dtype=np.float64))
 
 
-_TURN = _constant(2.0 * np.pi)
+_TURN, _HALF_TURN = _constant(2.0 * np.pi), _constant(np.pi)
 
 
 class Row:
     """Rows of a network's inputs, in the order and scales of ``layout``."""
 
     def __init__(self, layout: Sequence[Term[Any]]) -> None:
-        self._terms = [(term.name, _constant(term.scale)) for term in layout]
+        self._names = [term.name for term in layout]
+        scales = [np.broadcast_to(term.scale, term.size) for term in layout]
+        self._scale = _constant(np.concatenate(scales))
 
     def __call__(self, terms: Mapping[str, Tensor]) -> Tensor:
         """Terms by name, in the units that they are read in -> (n,) float32."""
-        return th.cat([scale * terms[name] for name, scale in self._terms]).float()
+        return (self._scale * th.cat([terms[name] for name in self._names])).float()
 
 
 @dataclass(frozen=True)
@@ -108,110 +111,120 @@ class ClippedActor(nn.Module):
         return th.as_tensor(self.actor(x)[0]).clamp(self.low, self.high)
 
 
-def foot_phases(clock: Tensor, command: Tensor) -> Tensor:
-    """Warped phase of each foot, as ``gaits.foot_phases``: (1,), (15,) -> (4,)."""
-    phase, offset, bound = command[12:].unbind()
-    duty = command[INDEX["duration"]]
-    raw = clock + th.stack([phase + offset + bound, offset, bound, phase])
+Commands = Mapping[str, Tensor]
+
+
+def by_command(command: Tensor) -> Commands:
+    """The 15 commands by name, (1,) each."""
+    return dict(zip(NAMES, command.chunk(NUM_COMMANDS), strict=True))
+
+
+def foot_phases(clock: Tensor, command: Commands) -> Tensor:
+    """Warped phase of each foot, as ``gaits.foot_phases``: (1,) or (n, 1) -> (4,) or (n, 4)."""
+    phase, offset, bound, duty = (command[name] for name in (*NAMES[12:], "duration"))
+    raw = clock + th.cat([phase + offset + bound, offset, bound, phase])
     raw = raw - raw.floor()
     swing = 0.5 + (raw - duty) * (0.5 / (1.0 - duty))
     return th.where(raw < duty, raw * (0.5 / duty), swing)
 
 
-def clock_signal(clock: Tensor, command: Tensor) -> Tensor:
-    """sin(2 pi phase) of each foot, as ``PhaseClock.signal``: (1,), (15,) -> (4,)."""
-    return th.sin(_TURN * foot_phases(clock, command))
-
-
-def clock_cosine(clock: Tensor, command: Tensor) -> Tensor:
-    """cos(2 pi phase) of each foot, as ``PhaseClock.cosine``: (1,), (15,) -> (4,)."""
-    return th.cos(_TURN * foot_phases(clock, command))
-
-
 class Pose(nn.Module):
-    """q0, as ``Locomotion.pose``: (1,), (1,), (15,) -> (12,) rad."""
+    """q0, as ``Locomotion.pose``.
+
+    Attributes:
+        ahead: (n, 1) s ahead of the clock, where phases of the feet are needed: now; to walk, also
+            the middle of the control step and when joints reach their targets.
+    """
 
     def __init__(self, robot: RobotConfig, control_dt: float) -> None:
         super().__init__()
         nominal = nominal_pose(robot)
         self.follows, self.nominal = robot.commanded_pose, _constant(nominal)
-        self.walks, self.kp = robot.commanded_gait, _constant(robot.kp)
-        self.middle = _constant(0.5 * control_dt)
-        self.ahead = _constant(0.5 * control_dt + robot.kd / robot.kp)
+        self.walks = robot.commanded_gait
+        middle = 0.5 * control_dt
+        ahead = [0.0, middle, middle + robot.kd / robot.kp] if self.walks else [0.0]
+        self.ahead = _constant(ahead)[:, None]
         geometry = read_geometry(robot)
         self.thigh, self.calf = geometry.thigh, geometry.calf
         standing, _ = foot_kinematics(geometry, nominal[None], np.zeros((1, NUM_JOINTS)))
         hips = np.pad(geometry.hips, ((0, 0), (0, 1)))
-        self.feet, self.default = _constant(standing[0] - hips), _constant(default_command())
-        self.front, self.side = _constant(FRONT), _constant(SIDE)
+        default = dict(zip(NAMES, default_command(), strict=True))
+        # Feet against their hips, without what the commands add.
+        x, y, z = (standing[0] - hips).T
+        self.x = _constant(x - 0.5 * default["stance_length"] * FRONT)
+        self.y = _constant(y - 0.5 * default["stance_width"] * SIDE)
+        lift = nominal_height(robot, geometry) - robot.base_height if self.walks else 0.0
+        raised = 0.0 if self.walks else default["swing_height"]
+        self.z, self.default_swing = _constant(z + default["body_height"] + lift), _constant(raised)
+        self.front, self.side = _constant(0.5 * FRONT), _constant(0.5 * SIDE)
         self.out = _constant(geometry.abduction * SIDE)
         self.lowest, self.highest = map(_constant, geometry.joint_limits[2::3].T)
-        self.hips = _constant(geometry.hips)
-        self.lift = _constant(nominal_height(robot, geometry) - robot.base_height)
-        self.weight = _constant(GRAVITY * sum(geometry.masses.values()))
+        self.hips_x, self.hips_y = map(_constant, geometry.hips.T)
+        # A leg's peak load, as in ``robot.stance_load``, times its duty factor over the stiffness.
+        weight = GRAVITY * sum(geometry.masses.values())
+        self.load = _constant(0.125 * np.pi * weight / robot.kp)
 
-    def forward(self, clock: Tensor, grown: Tensor, command: Tensor) -> Tensor:
-        """``grown``: share of the swing that is asked so far, as in ``PhaseClock.swing``."""
+    def forward(self, phases: Tensor, grown: Tensor, command: Commands) -> Tensor:
+        """Joint angles (12,) rad.
+
+        Args:
+            phases: (n, 4) of the feet, at ``ahead``.
+            grown: (1,) share of the swing that is asked so far, as in ``PhaseClock.swing``.
+            command: the commands in force.
+        """
         if not self.follows:
             return self.nominal
+        # Rows of the four feet, (1, 4), here and below.
+        swing = (2.0 * phases[-1:] - 1.0).clamp(0.0, 1.0)
+        raised = grown * (command["swing_height"] - self.default_swing) * th.sin(_HALF_TURN * swing)
+        x = self.x + command["stance_length"] * self.front
+        y = self.y + command["stance_width"] * self.side
+        z = self.z - command["body_height"] + raised
         if self.walks:
-            return self._walk(clock, grown, command)
-        swing = (2.0 * foot_phases(clock, command) - 1.0).clamp(0.0, 1.0)
-        raised = grown * th.sin(0.5 * _TURN * swing)
-        change = command - self.default
-        x = self.feet[:, 0] + 0.5 * change[INDEX["stance_length"]] * self.front
-        y = self.feet[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
-        z = self.feet[:, 2] - change[INDEX["body_height"]]
-        return self._angles(x, y, z + change[INDEX["swing_height"]] * raised).flatten()
+            pose = self._walk(x, y, z, phases, grown, command)
+        else:
+            pose = th.cat(self._angles(x, y, z))
+        return pose.T.flatten()
 
-    def _walk(self, clock: Tensor, grown: Tensor, command: Tensor) -> Tensor:
-        """As ``robot.walking_pose``."""
-        change, frequency = command - self.default, command[INDEX["frequency"]]
-        now = foot_phases(clock + self.middle * frequency, command)
-        phases = foot_phases(clock + self.ahead * frequency, command)
-        swing = (2.0 * phases - 1.0).clamp(0.0, 1.0)
-        raised = grown * command[INDEX["swing_height"]] * th.sin(0.5 * _TURN * swing)
-        # From here on against the hips, but for what turns about the trunk.
-        x = self.feet[:, 0] + self.hips[:, 0] + 0.5 * change[INDEX["stance_length"]] * self.front
-        y = self.feet[:, 1] + self.hips[:, 1] + 0.5 * change[INDEX["stance_width"]] * self.side
-        z = self.feet[:, 2] + self.lift - change[INDEX["body_height"]] + raised
-        turn, duty = command[INDEX["yaw_rate"]], command[INDEX["duration"]]
-        lead = grown * ((1.0 - 2.0 * phases).abs() - 0.5) * duty / frequency
-        x, y = (
-            x + lead * (command[INDEX["vx"]] - turn * y),
-            y + lead * (command[INDEX["vy"]] + turn * x),
-        )
-        pitch, roll = command[INDEX["pitch"]], command[INDEX["roll"]]
-        x, z = th.cos(pitch) * x - th.sin(pitch) * z, th.sin(pitch) * x + th.cos(pitch) * z
-        y, z = th.cos(roll) * y + th.sin(roll) * z, th.cos(roll) * z - th.sin(roll) * y
-        q = self._angles(x - self.hips[:, 0], y - self.hips[:, 1], z)
-        peak = 0.125 * 0.5 * _TURN * self.weight / duty
-        load = peak * th.sin(_TURN * now).clamp(min=0.0)
-        return (q - load[:, None] * self._rises(q) / self.kp).flatten()
-
-    def _rises(self, q: Tensor) -> Tensor:
-        """How much feet rise per rad of each joint, as in ``robot.load_torque``: (4, 3) m/rad."""
-        hip, thigh, calf = q.unbind(1)
+    def _walk(
+        self, x: Tensor, y: Tensor, z: Tensor, phases: Tensor, grown: Tensor, command: Commands
+    ) -> Tensor:
+        """As ``robot.walking_pose``, from feet in m against their hips: (3, 4) rad."""
+        turn, duty = command["yaw_rate"], command["duration"]
+        lead = ((1.0 - 2.0 * phases[2:]).abs() - 0.5) * (grown * duty / command["frequency"])
+        x, y = x + self.hips_x, y + self.hips_y  # what turns about the trunk
+        x, y = x + lead * (command["vx"] - turn * y), y + lead * (command["vy"] + turn * x)
+        pitch, roll = command["pitch"], command["roll"]
+        cos, sin = th.cos(pitch), th.sin(pitch)
+        x, z = cos * x - sin * z, sin * x + cos * z
+        cos, sin = th.cos(roll), th.sin(roll)
+        y, z = cos * y + sin * z, cos * z - sin * y
+        hip, thigh, calf = self._angles(x - self.hips_x, y - self.hips_y, z)
+        # What the load on the feet does to the joints, as ``robot.load_torque``.
+        load = (self.load / duty) * th.sin(_TURN * phases[1:2]).clamp(min=0.0)
         x_thigh, x_calf = self.thigh * th.sin(thigh), self.calf * th.sin(thigh + calf)
-        down = -self.thigh * th.cos(thigh) - self.calf * th.cos(thigh + calf)
-        y = self.out * th.cos(hip) - down * th.sin(hip)
-        return th.stack([y, (x_thigh + x_calf) * th.cos(hip), x_calf * th.cos(hip)], 1)
+        down = self.thigh * th.cos(thigh) + self.calf * th.cos(thigh + calf)
+        cos = th.cos(hip)
+        rises = th.cat(
+            [self.out * cos + down * th.sin(hip), (x_thigh + x_calf) * cos, x_calf * cos]
+        )
+        return th.cat([hip, thigh, calf]) - load * rises
 
-    def _angles(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Joint angles of feet at (4,) m each against their hips, as ``robot.leg_angles``: (4, 3)
-        rad."""
+    def _angles(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Angles of hips, thighs and calves in rad, as ``robot.leg_angles``, from feet in m against
+        their hips."""
         z = z.clamp(max=HIGHEST_FOOT)
         out, upper, lower = self.out, self.thigh, self.calf
         down = (y * y + z * z - out * out).clamp(min=0.0).sqrt()
         square = x * x + down * down
-        bend = (square - upper * upper - lower * lower) / (2.0 * upper * lower)
+        bend = (square - (upper * upper + lower * lower)) / (2.0 * upper * lower)
         # ONNX Runtime has inverse functions of float32 alone, and no arctan2.
         calf = (-th.acos(bend.clamp(-1.0, 1.0).float())).double()
         calf = calf.clamp(self.lowest, self.highest)
         lean = lower * th.sin(calf) / (upper + lower * th.cos(calf))
-        hip = th.atan(((out * z + down * y) / (out * y - down * z)).float()).double()
-        thigh = (th.atan((-x / down).float()) - th.atan(lean.float())).double()
-        return th.stack([hip, thigh, calf], 1)
+        slopes = th.cat([(out * z + down * y) / (out * y - down * z), x / down, lean])
+        hip, back, lean = th.atan(slopes.float()).double().chunk(3)
+        return hip, -back - lean, calf
 
 
 class LowGraph(nn.Module):
@@ -292,27 +305,29 @@ class LowGraph(nn.Module):
             early = 1.0 - (cycles / self.start).clamp(max=1.0)
             missing = (self.least - command[INDEX["frequency"]]).clamp(min=0.0)
             command = command + self.is_frequency * (early * missing)
-        pose = self.pose(clock, grown, command)
+        named = by_command(command)
+        phases = foot_phases(clock + self.pose.ahead * named["frequency"], named)
+        pose = self.pose(phases, grown, named)
         terms = x | {
             "joint_error": x["joint_angles"] - pose,
             "pose": pose - self.nominal,
             "joint_speed": x["joint_speeds"],
             "command": self.command_gain * command + self.command_zero,
-            "clock": clock_signal(clock, command),
-            "clock_cosine": clock_cosine(clock, command),
-            "gait": self._gait(command),
+            "clock": th.sin(_TURN * phases[:1].flatten()),
+            "clock_cosine": th.cos(_TURN * phases[:1].flatten()),
+            "gait": self._gait(named),
         }
         action = self.actor(self.row(terms)[None]).double().clamp(-self.limit, self.limit)
-        run = self.dt * command[INDEX["frequency"]]
+        run = self.dt * named["frequency"]
         clock = clock + run
         targets = (pose + self.joint_scale * action).clamp(self.lowest, self.highest)
         step = (action, targets, clock - clock.floor())
         return (*step, cycles + run) if self.counted else step
 
-    def _gait(self, command: Tensor) -> Tensor:
+    def _gait(self, command: Commands) -> Tensor:
         """Index of the gait as a share of the last one's, as the observation has it: (1,)."""
         trot, pronk, pace, bound = self.gait_shares.unbind()
-        phase, offset, pairs = (command[i : i + 1] > 0.25 for i in (12, 13, 14))
+        phase, offset, pairs = (command[name] > 0.25 for name in NAMES[12:])
         return th.where(phase, trot, th.where(pairs, pace, th.where(offset, bound, pronk)))
 
 
@@ -388,6 +403,7 @@ class HighGraph(nn.Module):
     def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
         """``inputs`` -> ``outputs``."""
         x = _by_name(self.inputs, values)
+        phases = _TURN * foot_phases(x["clock"], by_command(x["last_commands"]))
         goal = x["goal"]
         distance = (goal * goal).sum(0, keepdim=True).sqrt()
         direction = th.where(distance > 0.0, goal / distance, self.ahead)
@@ -397,8 +413,8 @@ class HighGraph(nn.Module):
             "joint_error": x["joint_angles"] - self.nominal,
             "joint_speed": x["joint_speeds"],
             "last_action": self._normalise(x["last_decision"]),
-            "clock": clock_signal(x["clock"], x["last_commands"]),
-            "clock_cosine": clock_cosine(x["clock"], x["last_commands"]),
+            "clock": th.sin(phases),
+            "clock_cosine": th.cos(phases),
         }
         if "probes" in x:
             terms["probes"] = x["probes"].clamp(-PROBE_RANGE, PROBE_RANGE)
