@@ -260,8 +260,8 @@ def test_an_episode_that_succeeded_has_no_diagnosis():
 def test_evidence_gives_the_numbers():
     found = diagnose(walk(error_vx=0.3, error_vy=0.4, at_bound_yaw_rate=-1.0), HIPS)
     assert found.evidence == (
-        "in the last 2 s: velocity off by 0.50 m/s (limit 0.26); yaw rate off by 0.00 rad/s "
-        "(limit 0.12); tilt off by 0.00 rad (limit 0.34); asked for +0.50 m/s towards the goal; "
+        "in the last 2 s: velocity off by 0.50 m/s (limit 0.24); yaw rate off by 0.00 rad/s "
+        "(limit 0.11); tilt off by 0.00 rad (limit 0.37); asked for +0.50 m/s towards the goal; "
         "yaw_rate at its bound 100 % of the time"
     )
     assert (found.time_s, found.place, found.seed) == (6.0, "zone", 0)
