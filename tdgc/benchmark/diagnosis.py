@@ -66,9 +66,9 @@ class Limit:
     episode: float
 
 
-#: The 95th percentiles of all stretches, and of all episodes, of 168 that reached their goals: both
-#: policies, five episodes on levels 6 and 8 of each family, evaluation seeds 1 and 2. Stairs make up
-#: the upper end.
+#: The 95th percentiles of all stretches, and of all episodes, of 168 that reached their goals:
+#: both policies, five episodes on levels 6 and 8 of each family, evaluation seeds 1 and 2. Stairs
+#: make up the upper end.
 LIMITS: dict[str, Limit] = {
     "velocity": Limit("m/s", 0.24, 0.13),
     "yaw rate": Limit("rad/s", 0.11, 0.08),
