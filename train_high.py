@@ -31,6 +31,7 @@ from tdgc.policies import Policy
 from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
+from tdgc.sim.locomotion import check_latency
 from tdgc.sim.terrain import EDITION
 from tdgc.sim.world import check_robot
 from tdgc.tasks.high_env import (
@@ -86,10 +87,7 @@ def make_env(
     config: HighTrainConfig, low: Policy, taught: bool, led: float, timeout: float, link: MakeLink
 ) -> TaskVecEnv:
     """The workers; ``taught`` and ``led`` as ``NavigationTask`` has them."""
-    env_config = config.env
-    if config.imitation.steps:  # what was imitated on all levels goes on on all
-        env_config = dataclasses.replace(env_config, first_levels=env_config.levels)
-    landing = None
+    env_config, landing = config.env, None
     if taught and "gap" in env_config.families:
         landing = measure_landing(*load_low(low))
         if landing is None:
@@ -146,7 +144,9 @@ def build_imitation(
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
     """Workers with a teacher, and the apprentice."""
     imitation = config.imitation
-    mdp = dataclasses.replace(config.env, curriculum=imitation.curriculum)
+    mdp = dataclasses.replace(
+        config.env, curriculum=imitation.curriculum, first_levels=config.env.levels
+    )
     shown, led = dataclasses.replace(config, env=mdp), _LED * (imitation.steps // config.n_envs)
     env = make_env(shown, low, True, led, timeout, link)
     model = make_learner(
@@ -162,6 +162,9 @@ def build_reinforcement(
     config: HighTrainConfig, low: Policy, device: str, timeout: float, link: MakeLink
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
     """Workers and learner of reinforcement learning, with a teacher if it goes on imitating."""
+    if begins_hardest(config):
+        mdp = dataclasses.replace(config.env, first_level=config.env.levels - 1, first_levels=1)
+        config = dataclasses.replace(config, env=mdp)
     taught = bool(config.imitation.steps) and config.ppo.imitation_coef > 0.0
     env = make_env(config, low, taught, 0.0, timeout, link)
     model = make_learner(
@@ -174,16 +177,21 @@ def build_reinforcement(
     return model, env
 
 
+def begins_hardest(config: HighTrainConfig) -> bool:
+    """Whether reinforcement learning begins on the hardest level."""
+    return bool(config.imitation.steps) and config.imitation.levels_after == "hardest"
+
+
 def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
     """Imitation of the teacher, if any, and then reinforcement learning."""
     imitated = min(config.imitation.steps, config.steps)
     both = (
-        ("imitation", build_imitation, imitated),
-        ("learning", build_reinforcement, config.steps),
+        ("imitation", build_imitation, imitated, False),
+        ("learning", build_reinforcement, config.steps, begins_hardest(config)),
     )
     return [
-        Phase(name, functools.partial(build, config, low, device), until)
-        for name, build, until in both
+        Phase(name, functools.partial(build, config, low, device), until, own_levels)
+        for name, build, until, own_levels in both
         if until > 0
     ]
 
@@ -234,6 +242,7 @@ def main(arguments: list[str] | None = None) -> int:
         low, low_config = load_low(cast(str, config.low))
         tqdm.write(f"low policy: {config.low}")
         check_robot(low_config.robot, low_config.physics)
+        check_latency(config.env.randomisation, low_config.physics)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check_families(config.env.families)
         check(config)

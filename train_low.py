@@ -35,7 +35,7 @@ from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.show import plots
-from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.locomotion import actor_layout, check_latency
 from tdgc.sim.observation import width
 from tdgc.sim.robot import fitted
 from tdgc.sim.terrain import EDITION
@@ -168,6 +168,7 @@ def main(arguments: list[str] | None = None) -> int:
             config = fit(config, args.assignments)
         check_families(config.env.families)
         check_robot(config.env.robot, config.env.physics)
+        check_latency(config.env.randomisation, config.env.physics)
         meta = {
             "config": to_dict(config.env),
             "seed": config.seed,

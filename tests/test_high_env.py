@@ -435,6 +435,16 @@ def test_robots_begin_spread_over_the_first_levels():
     task = NavigationTask(config, LOW, 8, seed=0)
     assert task.curriculum.levels.tolist() == [0, 0, 1, 1, 2, 2, 0, 0]
     task.close()
+    config = dataclasses.replace(config, first_level=7, first_levels=2)
+    task = NavigationTask(config, LOW, 8, seed=0)
+    levels = [7, 7, 8, 8, 7, 7, 8, 8]
+    assert task.curriculum.levels.tolist() == levels
+    task.curriculum.push(np.arange(8), np.zeros(8, dtype=bool))
+    state = task.state_dict()
+    del state["episodes"], state["curriculum"]  # of a phase before, with levels of its own
+    task.load_state_dict(state)
+    assert task.curriculum.levels.tolist() == task.tiles.level.tolist() == levels
+    task.close()
 
 
 def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tdgc import policies
-from tdgc.config import HighTrainConfig, LowTrainConfig, recorded, to_dict
+from tdgc.config import HighLevelConfig, HighTrainConfig, LowTrainConfig, recorded, to_dict
 from tdgc.sim.terrain import EDITION
 from tdgc.tasks.high_env import PRETRAINED, load_low, paired
 
@@ -43,7 +43,8 @@ def test_the_high_policy_was_trained_with_the_defaults() -> None:
     # A setting that came later has the value that the run had without it.
     assert recorded(HighTrainConfig, read(path), path) == config
     meta = policies.load(PRETRAINED / "high").meta
-    assert meta["config"] == plain(config.env) and meta["low"]["config"] == plain(low)
+    assert recorded(HighLevelConfig, meta["config"], "high") == config.env
+    assert meta["low"]["config"] == plain(low)
 
 
 @pytest.mark.parametrize(

@@ -395,7 +395,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         "--set", "ppo.minibatches=2", "--set", "imitation.minibatches=2", "--set", "ppo.n_epochs=2",
         "--set", "ppo.lstm=8",
         "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.7",
-        "--set", "imitation.steps=16",
+        "--set", "imitation.steps=16", "--set", "imitation.levels_after=hardest",
     ]  # fmt: skip
     monkeypatch.chdir(ROOT)  # the shipped low policy is named from there
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -406,6 +406,8 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     # What imitation gave stays beside what came of it.
     imitated, learned = (policies.load(whole / name) for name in ("imitation", "policy"))
     assert (imitated.meta["steps"], learned.meta["steps"]) == (16, 40)
+    # Levels are drawn while imitating; then all are the hardest, and no episode has ended yet.
+    assert [rows(whole)[1][f"level/{family}"] for family in ("rough", "pillar")] == [10.0, 10.0]
     # Half way from 2e-3 to 2e-4 in imitation; after 24 of 40 steps from 1.5e-4 to 5e-5.
     rates = [row["train/learning_rate"] for row in rows(whole)]
     assert rates == pytest.approx([1.1e-3, 5e-5 + 0.4 * 1e-4])
@@ -561,6 +563,10 @@ def test_flags_and_folders_that_cannot_be_used(
         "unknown configuration key 'env.robot.kq'": ["--set", "env.robot.kq=1"],
         "cannot read --set 'seed'": ["--set", "seed"],
         "not a JSON file": ["--resume", "--out", str(damaged)],
+        "'randomisation.latency' times its scale must be from 0 to 0.04 s, not 0 to 0.05": [
+            "--set",
+            "env.randomisation.latency=[0,0.05]",
+        ],
         "unknown terrain family 'sand'; choose from flat, rough, ": [
             "--set",
             'env.families=["sand"]',
@@ -577,6 +583,7 @@ def test_flags_and_folders_that_cannot_be_used(
         ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
         ("env.unknown_share=1.5", "'env.unknown_share' must be from 0 to 1, not 1.5"),
         ("env.unknown_share=-0.1", "'env.unknown_share' must be from 0 to 1, not -0.1"),
+        ("env.randomisation.scale=1.5", "'randomisation.latency' times its scale must be "),
         ("env.gaits=[]", "gaits must be some of trot, pronk, pace, bound, each once, not []"),
         ("ppo.gait_hold=0", "'ppo.gait_hold' must be at least 1, not 0"),
         ("ppo.gait_ent_coef=-1", "'ppo.gait_ent_coef' must be at least 0, and 0 without an ent_"),

@@ -80,7 +80,9 @@ class HighLevelConfig:
     shallowest_trench: float | None = field(default=None, metadata={"before": None})
     window: int = 4  # W episodes: short, since an episode of every robot takes minutes on two cores
     threshold: int = 3  # S successes of them
-    first_levels: int = 1  # robots begin spread over levels 0..first_levels-1
+    # Robots begin spread over ``first_levels`` levels, of which ``first_level`` is the lowest.
+    first_level: int = field(default=0, metadata={"before": 0})
+    first_levels: int = 1
     episode_seconds: float = 20.0  # T_max (benchmark)
     hold_seconds: float = 2.0  # an episode goes on that long after the goal was reached
     action_limit: float = 1.0  # a_max of the decoder

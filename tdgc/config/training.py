@@ -115,6 +115,9 @@ class ImitationConfig:
     curriculum: Literal["performance", "uniform", "hardest"] = field(
         default="uniform", metadata={"before": "performance"}
     )
+    # The levels that reinforcement learning begins on: those that robots are on when imitation
+    # ends, or the hardest for all, from where their performance takes them down.
+    levels_after: Literal["kept", "hardest"] = field(default="kept", metadata={"before": "kept"})
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,14 @@ class Phase:
         name: for the progress bar.
         build: makes the learner and its workers, given their ``timeout`` and what starts one.
         until: steps of the run at which the phase ends.
+        own_levels: whether robots begin on the levels that its environment has them begin on; else
+            they stay on those where the phase before left them.
     """
 
     name: str
     build: Callable[[float, MakeLink], tuple[Any, TaskVecEnv]]
     until: int
+    own_levels: bool = False
 
 
 class Interruption:
@@ -142,8 +145,10 @@ class Run:
             if last is not None:
                 last.restore(model)
                 states = last.workers()
-                if last.header["phase"] != number:  # episodes end with a phase, levels go on
+                if last.header["phase"] != number:  # episodes end with a phase
                     states = [without_episodes(state) for state in states]
+                    if phase.own_levels:
+                        states = [{k: v for k, v in s.items() if k != "curriculum"} for s in states]
                 env.load_state_dicts(states)
             else:
                 if self.init is not None:

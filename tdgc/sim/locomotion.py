@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.config import PhysicsConfig, RandomisationConfig, Range, RobotConfig
+from tdgc.config import ConfigError, PhysicsConfig, RandomisationConfig, Range, RobotConfig
 from tdgc.sim.commands import INDEX, NAMES, SIDEWAYS, default_command, gait_index, observed_command
 from tdgc.sim.gaits import GAITS, PhaseClock, foot_phases
 from tdgc.sim.geometry import Geometry
@@ -36,6 +36,21 @@ SPEED_SCALE = 0.05  # s/rad, joint speed as the networks see it (Walk These Ways
 GYRO_SCALE = 0.25  # s/rad, angular velocity likewise
 _FREQUENCY = INDEX["frequency"]
 _HISTORY = 3  # control steps of targets kept: the step, and two before for latency up to 40 ms
+
+
+def check_latency(config: RandomisationConfig, physics: PhysicsConfig) -> None:
+    """See that latencies are no longer than the time for which joint targets are kept.
+
+    Raises:
+        ConfigError: says what is allowed.
+    """
+    kept = (_HISTORY - 1) * physics.control_dt
+    shortest, longest = config.scale * config.latency[0], config.scale * config.latency[1]
+    if shortest < 0.0 or longest > kept:
+        raise ConfigError(
+            f"'randomisation.latency' times its scale must be from 0 to {kept:g} s, not "
+            f"{shortest:g} to {longest:g}"
+        )
 
 
 class Locomotion:
@@ -157,8 +172,12 @@ class Locomotion:
         """Draw the physical parameters of the robots ``index`` about their nominal values.
 
         ``width`` (n,) scales each robot's ranges, as ``config.scale`` does all.
+
+        Raises:
+            ConfigError: as ``check_latency``.
         """
         n = len(index)
+        check_latency(config, self.physics)
         scale = np.broadcast_to(config.scale * np.asarray(width), n)
 
         def draw(bounds: Range, nominal: float, shape: tuple[int, ...] = (n,)) -> Array:

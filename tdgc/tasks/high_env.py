@@ -296,7 +296,7 @@ class NavigationTask:
         self.horizon = round(config.episode_seconds / self.step_seconds)
         self._hold = round(config.hold_seconds / self.step_seconds)
         self.family = np.arange(m) % len(config.families)
-        first = np.arange(m) // len(config.families) % config.first_levels
+        first = np.arange(m) // len(config.families) % config.first_levels + config.first_level
         if config.curriculum == "hardest":
             first[:] = config.levels - 1
         self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, first)
@@ -546,13 +546,14 @@ class NavigationTask:
 
     def load_state_dict(self, state: State) -> None:
         """Go on from a ``state_dict``, as a ``forget`` there would have gone on; from one without
-        ``episodes`` with new ones.
+        ``episodes`` with new ones, from one without a ``curriculum`` with the levels there are.
 
         Raises:
             ValueError: a state of other robots.
         """
         self.rng.bit_generator.state = state["rng"]
-        self.curriculum.load_state_dict(state["curriculum"])
+        if "curriculum" in state:
+            self.curriculum.load_state_dict(state["curriculum"])
         self.tiles.drawn = int(state["tiles_drawn"])
         self._decisions[:] = state["decisions"]
         if "episodes" not in state:
