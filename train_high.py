@@ -19,7 +19,7 @@ import torch as th
 from tqdm import tqdm
 
 from tdgc import __version__, policies
-from tdgc.config import NO_TEACHER, PRESETS, ConfigError, HighTrainConfig, to_dict
+from tdgc.config import NO_TEACHER, PRESETS, ConfigError, HighTrainConfig, to_dict, with_overrides
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, shared_keywords
@@ -31,9 +31,12 @@ from tdgc.policies import Policy
 from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
-from tdgc.sim.locomotion import check_latency
+from tdgc.sim.geometry import read_geometry
+from tdgc.sim.locomotion import check_randomisation
+from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EDITION
 from tdgc.sim.world import check_robot
+from tdgc.tasks.curriculum import check_rules
 from tdgc.tasks.high_env import (
     PRETRAINED,
     NavigationTask,
@@ -45,7 +48,7 @@ from tdgc.tasks.high_env import (
 )
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.teacher import STYLES
-from tdgc.tasks.tiles import check_families
+from tdgc.tasks.tiles import check_families, check_levels
 
 _LED = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
 #: Where train_low.py leaves its policy by default.
@@ -65,6 +68,16 @@ def find_low() -> str:
     return str(PRETRAINED / "low")
 
 
+def start_command(config: HighTrainConfig) -> Array:
+    """Walking straight on in the default gait, (15,)."""
+    decoder = CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
+    command = decoder.nearest(default_command())
+    command[INDEX["vx"]] = config.start_speed
+    if config.env.behaviour == "all":
+        command[INDEX["swing_height"]] = config.start_swing
+    return command
+
+
 def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
     """Let the untrained policy's mean action be walking straight on in the default gait.
 
@@ -72,10 +85,7 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
     it would stand still in a random gait.
     """
     decoder = CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
-    command = decoder.nearest(default_command())
-    command[INDEX["vx"]] = config.start_speed
-    if config.env.behaviour == "all":
-        command[INDEX["swing_height"]] = config.start_swing
+    command = start_command(config)
     with th.no_grad():
         head = policy.action_net
         bias = (head.linear if isinstance(head, MirroredHead) else head).get_parameter("bias")
@@ -202,49 +212,60 @@ def check(config: HighTrainConfig) -> None:
     Raises:
         ValueError: says which one, and what is allowed.
     """
-    unknown, ppo = config.env.unknown_share, config.ppo
-    if not 0.0 <= unknown <= 1.0:
-        raise ConfigError(f"'env.unknown_share' must be from 0 to 1, not {unknown:g}")
-    if ppo.gait_hold < 1:
-        raise ConfigError(f"'ppo.gait_hold' must be at least 1, not {ppo.gait_hold}")
-    for name in ("gait_ent_coef", "imitation_coef"):  # SB3 multiplies what they weigh by ent_coef
-        weight = getattr(ppo, name)
-        if weight < 0.0 or (weight > 0.0 and not ppo.ent_coef > 0.0):
-            raise ConfigError(
-                f"'ppo.{name}' must be at least 0, and 0 without an ent_coef, not {weight:g}"
-            )
-    CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
+    env, ppo = config.env, config.ppo
+    check_families(env.families)
+    check_levels(env.levels)
+    check_rules(env.window, env.threshold, env.levels)
+    if env.first_level + env.first_levels > env.levels:
+        raise ConfigError(
+            f"'env.first_level' and 'env.first_levels' must leave robots on the {env.levels} "
+            f"levels, not on {env.first_levels} from {env.first_level} up"
+        )
+    if not ppo.ent_coef:  # SB3 multiplies what these weigh by it
+        for name, used in (("gait_ent_coef", True), ("imitation_coef", config.imitation.steps)):
+            if used and getattr(ppo, name):
+                raise ConfigError(f"'ppo.{name}' needs an 'ppo.ent_coef' above 0; or set it to 0")
+    if ppo.mirror:
+        high_mirror(env)
+    start = start_command(config)
+    try:
+        CommandDecoder(env.commands, env.action_limit, env.gaits).encode(start)
+    except ValueError as error:
+        raise ConfigError(f"'start_speed' or 'start_swing' cannot be walked: {error}") from None
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    add_arguments(parser, "runs/high", HighTrainConfig())
+    add_arguments(parser, "runs/high", HighTrainConfig(), "decisions")
     high = parser.add_argument_group("high policy")
     high.add_argument(
-        "--low", help="low policy (what train_low.py left in runs/low, or else the shipped one)"
+        "--low", help="low policy (that of a finished run in runs/low, or else the shipped one)"
     )
-    high.add_argument(
+    recipe = high.add_mutually_exclusive_group()
+    recipe.add_argument(
         "--preset", choices=PRESETS, default="default",
-        help="paper: the paper's hyperparameters (default)",
+        help="hyperparameters: default, or paper for the paper's (default)",
     )  # fmt: skip
-    high.add_argument(
-        "--no-teacher", action="store_true", help="reinforcement learning alone, on any terrain"
+    recipe.add_argument(
+        "--no-teacher", action="store_true", help="reinforcement learning alone, without imitation"
     )
     args = parser.parse_args(arguments)
-    args.assignments[:0] = PRESETS[args.preset] + (NO_TEACHER if args.no_teacher else ())
-    if args.init is not None and not args.resume:
-        args.assignments.insert(0, "imitation.steps=0")  # it would unlearn what it begins with
+    preset = (*PRESETS[args.preset], *(NO_TEACHER if args.no_teacher else ()))
+    if args.init is not None:
+        preset += ("imitation.steps=0",)  # it would unlearn what it begins with
     if args.low is not None:
         args.assignments.append(f"low={args.low}")
     try:
-        config = configure(HighTrainConfig(), args)
+        if args.resume and (args.no_teacher or PRESETS[args.preset]):
+            raise ConfigError("--resume goes on as its run began: no --preset or --no-teacher")
+        config = configure(with_overrides(HighTrainConfig(), preset), args)
         config = dataclasses.replace(config, low=config.low or find_low())
         low, low_config = load_low(cast(str, config.low))
         tqdm.write(f"low policy: {config.low}")
         check_robot(low_config.robot, low_config.physics)
-        check_latency(config.env.randomisation, low_config.physics)
+        trunk = read_geometry(low_config.robot).trunk_mass
+        check_randomisation(config.env.randomisation, low_config.physics, trunk)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
-        check_families(config.env.families)
         check(config)
         if config.imitation.steps:
             for family in dict.fromkeys(config.env.families):

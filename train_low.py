@@ -35,7 +35,8 @@ from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.show import plots
-from tdgc.sim.locomotion import actor_layout, check_latency
+from tdgc.sim.geometry import read_geometry
+from tdgc.sim.locomotion import actor_layout, check_randomisation
 from tdgc.sim.observation import width
 from tdgc.sim.robot import fitted
 from tdgc.sim.terrain import EDITION
@@ -43,7 +44,7 @@ from tdgc.sim.world import check_robot
 from tdgc.tasks.low_env import make_task
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 from tdgc.tasks.low_statistics import summarise
-from tdgc.tasks.tiles import check_families
+from tdgc.tasks.tiles import check_families, check_levels
 
 
 def phases(config: LowTrainConfig, device: str) -> list[Phase]:
@@ -160,15 +161,17 @@ def build(
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    add_arguments(parser, "runs/low", LowTrainConfig())
+    add_arguments(parser, "runs/low", LowTrainConfig(), "control steps")
     args = parser.parse_args(arguments)
     try:
         config = configure(LowTrainConfig(), args)
         if not args.resume:
             config = fit(config, args.assignments)
         check_families(config.env.families)
+        check_levels(config.env.levels)
         check_robot(config.env.robot, config.env.physics)
-        check_latency(config.env.randomisation, config.env.physics)
+        trunk = read_geometry(config.env.robot).trunk_mass
+        check_randomisation(config.env.randomisation, config.env.physics, trunk)
         meta = {
             "config": to_dict(config.env),
             "seed": config.seed,

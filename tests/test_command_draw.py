@@ -58,6 +58,16 @@ def test_strides_of_pronk_are_not_too_long() -> None:
     assert frequency[gaits == 1].min() < 2.05
 
 
+def test_pronk_is_as_fast_as_its_quickest_steps_allow() -> None:
+    slow = dataclasses.replace(CONFIG.commands, frequency=(1.5, 2.0))
+    config = dataclasses.replace(CONFIG, commands=slow)
+    draw = CommandDraw(config, np.random.default_rng(0), training=False)
+    gaits, values = drawn(draw, 4000)
+    speed, frequency = np.hypot(values[:, 0], values[:, 1]), values[:, INDEX["frequency"]]
+    assert 1.5 <= frequency.min() and frequency.max() <= 2.0
+    assert 0.95 < speed[gaits == 1].max() < 0.96 + 1e-9 and speed[gaits != 1].max() > 1.2
+
+
 def test_training_begins_with_a_share_of_the_velocity_ranges() -> None:
     draw = make(training=True, command_start=0.25)
     assert draw.share.tolist() == [0.25] * 4

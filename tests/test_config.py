@@ -123,7 +123,10 @@ def test_configurations_cannot_be_changed_in_place() -> None:
         ({"env": {"commands": {"vx": [0, "1"]}}}, "'env.commands.vx' must be of type float, not"),
         ({"env": {"commands": {"vx": [0, 1, 2]}}}, "'env.commands.vx' must have 2 values, not 3"),
         ({"env": {"crossing": {"share": 1.5}}}, "crossing.share' must be from 0 to 1, not 1.5"),
-        ({"env": {"crossing": {"gaits": [1, 1, 0, 0]}}}, "crossing.gaits' must add up to 1, not"),
+        (
+            {"env": {"crossing": {"gaits": [1, 1, 0, 0]}}},
+            "crossing.gaits' must be shares that add up to 1, not",
+        ),
         ({"env": {"crossing": {"gaits": [2, -1, 0, 0]}}}, "gaits' must be from 0 to 1, not 2"),
         ({"env": {"commands": {"vx": [0, float("inf")]}}}, "vx' must be a finite number, not inf"),
     ],

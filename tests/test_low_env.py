@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
+from tdgc.parallel.group import TaskGroup
 from tdgc.sim.commands import INDEX, default_command, gait_index
 from tdgc.sim.gaits import gait_embedding
 from tdgc.sim.observation import columns, width
@@ -21,9 +22,10 @@ from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import make_tile, tile_rng
 from tdgc.state import State, split
 from tdgc.tasks.command_draw import PRONK
+from tdgc.tasks.crossings import within
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.leaps import DURATION
-from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask
+from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask, make_task
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_spaces
 from tdgc.tasks.low_statistics import summarise
 from tdgc.tasks.rules import is_fallen
@@ -784,6 +786,48 @@ def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
     other.close()
 
 
+def test_planned_leaps_go_on_from_a_state() -> None:
+    """Their plans are older than what is known of landings when the state is taken."""
+    pronk = dataclasses.replace(TILES.crossing, share=1.0, trench_gaits=(0.0, 1.0, 0.0, 0.0))
+    config = dataclasses.replace(TILES, families=("gap",), crossing=pronk)
+    task, other = (LowLevelTask(config, 3, seed=5) for _ in range(2))
+    task.restart()
+    task.crossings.landing.spread += 0.05
+    state = task.state_dict()
+    assert state["episodes"]["spread"].tolist() == [0.0, 0.0, 0.0]
+    task.forget()
+    other.load_state_dict(state)
+    still = np.zeros((3, 12))
+    for _ in range(30):
+        task.step(still)
+        other.step(still)
+        np.testing.assert_array_equal(other.locomotion.command, task.locomotion.command)
+    assert (task.episodes.leaping & (task.episodes.elapsed > 5)).any()
+    task.close()
+    other.close()
+
+
+def test_velocities_of_a_crossing_stay_within_their_bounds() -> None:
+    low, high = np.array([-0.2, 0.0]), np.array([1.2, 0.0])
+    wanted = np.array([[0.6, 0.3], [2.4, 1.0], [-0.8, -0.1], [0.0, 0.5]])
+    found = within(wanted, low, high)
+    np.testing.assert_allclose(found, [[0.6, 0.0], [1.2, 0.0], [-0.2, 0.0], [0.0, 0.0]])
+    both = within(np.array([[0.8, 0.8]]), np.array([-1.0, -0.4]), np.array([1.0, 0.4]))
+    np.testing.assert_allclose(both, [[0.4, 0.4]])  # in the same direction
+
+
+def test_the_least_of_a_workers_robots_is_on_tiles() -> None:
+    """Of two robots and one."""
+    for robots, groups in ((2, [1, 1]), (1, None)):
+        task = make_task((PLANE, TILES), 0.99, robots, 0)
+        if groups is None:
+            assert isinstance(task, LowLevelTask) and task.tiles is not None
+        else:
+            assert isinstance(task, TaskGroup)
+            assert [part.num_robots for part in task.tasks] == groups
+        task.close()
+
+
 def test_a_checkpoint_names_what_it_holds() -> None:
     """Runs are resumed by later versions, so names, sizes and kinds of numbers stay."""
     task = begin(TILES, 3, training=True)
@@ -801,7 +845,7 @@ def test_a_checkpoint_names_what_it_holds() -> None:
         "tilts": "float64 (3, 26, 2)",
         "crossing": flags, "leaping": flags, "reached": flags, "retried": flags,
         "was_contact": "bool (3, 4)",
-        "speed": numbers, "follow": numbers, "pitch": numbers, "facing": numbers,
+        "speed": numbers, "follow": numbers, "pitch": numbers, "facing": numbers, "spread": numbers,
         "waypoint": "float64 (3, 2)", "origin": "float64 (3, 2)", "gait_scores": "float64 (4, 4)",
     }  # fmt: skip
     task.close()

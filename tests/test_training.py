@@ -36,7 +36,7 @@ from tdgc.config import (
 )
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import add_arguments, configure
-from tdgc.learn.run import Interruption, append_line
+from tdgc.learn.run import Interruption, append_line, drop_rows_after
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
 from tdgc.policies import AsymmetricActorCriticPolicy
@@ -229,6 +229,20 @@ def test_a_line_is_added_whole_or_not_at_all(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ interruption
 
 
+def test_rows_that_a_resumed_run_writes_again_are_dropped(tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    drop_rows_after(100, log)
+    assert not log.exists()
+    lines = ['{"steps": 100}', '{"steps": 200}', '{"steps": 300}']
+    for line in lines:
+        append_line(log, line)
+    drop_rows_after(300, log)
+    assert log.read_text().split("\n") == [*lines, ""]
+    drop_rows_after(250, log)
+    append_line(log, '{"steps": 260}')
+    assert log.read_text().split("\n") == [*lines[:2], '{"steps": 260}', ""]
+
+
 def test_time_limit() -> None:
     assert not Interruption(None).due() and not Interruption(1000.0).due()
     over = Interruption(-1.0)
@@ -417,6 +431,10 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         assert train_high.main([*arguments, "--out", str(broken)]) == 0
     stopped = Checkpoint.read(newest(broken))
     assert stopped.steps == 8 and stopped.header["phase"] == 0
+    # Flags that it cannot go on with leave it as it is.
+    config = (broken / "config.json").read_text(encoding="utf-8")
+    assert train_high.main(["--resume", "--out", str(broken), "--n-envs", "3"]) == 2
+    assert (broken / "config.json").read_text(encoding="utf-8") == config
     kill_run("train_high.py", ["--resume", "--out", str(broken)], last, after=0.05)
     cut = Checkpoint.read(newest(broken))
     assert cut.steps < 40
@@ -563,7 +581,7 @@ def test_flags_and_folders_that_cannot_be_used(
         "unknown configuration key 'env.robot.kq'": ["--set", "env.robot.kq=1"],
         "cannot read --set 'seed'": ["--set", "seed"],
         "not a JSON file": ["--resume", "--out", str(damaged)],
-        "'randomisation.latency' times its scale must be from 0 to 0.04 s, not 0 to 0.05": [
+        "'randomisation.latency' times its scale must be from 0 to 0.04, not [0, 0.05]": [
             "--set",
             "env.randomisation.latency=[0,0.05]",
         ],
@@ -581,23 +599,76 @@ def test_flags_and_folders_that_cannot_be_used(
         assert error.count("\n") == 1
     for setting, message in (
         ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
+        ("env.window=8", "threshold must be above (window + 1) / 2 and at most window, not 3 with"),
+        (
+            "env.first_levels=20",
+            "'env.first_level' and 'env.first_levels' must leave robots on the",
+        ),
+        ("env.levels=0", "'env.levels' must be at least 1, not 0"),
+        ("env.levels=13", "'env.levels' must be from 1 to 11, not 13"),
+        ("env.decimation=0", "'env.decimation' must be at least 1, not 0"),
+        ("env.families=[]", "'env.families' must name at least one terrain family"),
+        ("env.randomisation.payload=[-20,0]", "'randomisation.payload' times its scale must be "),
+        (
+            "env.commands.vy=[-0.2,0.6]",
+            "commands.vy must be the same to both sides for a symmetric",
+        ),
+        ("start_speed=3", "'start_speed' or 'start_swing' cannot be walked: vx 3.0 is outside "),
+        ("ppo.minibatches=0", "'ppo.minibatches' must be at least 1, not 0"),
+        ("ppo.initial_std=0", "'ppo.initial_std' must be above 0, not 0"),
+        ("seed=-1", "'seed' must be at least 0, not -1"),
+        ("steps=0", "'steps' must be at least 1, not 0"),
+        ("ppo.ent_coef=0", "'ppo.imitation_coef' needs an 'ppo.ent_coef' above 0; or set it to 0"),
         ("env.unknown_share=1.5", "'env.unknown_share' must be from 0 to 1, not 1.5"),
         ("env.unknown_share=-0.1", "'env.unknown_share' must be from 0 to 1, not -0.1"),
         ("env.randomisation.scale=1.5", "'randomisation.latency' times its scale must be "),
         ("env.gaits=[]", "gaits must be some of trot, pronk, pace, bound, each once, not []"),
         ("ppo.gait_hold=0", "'ppo.gait_hold' must be at least 1, not 0"),
-        ("ppo.gait_ent_coef=-1", "'ppo.gait_ent_coef' must be at least 0, and 0 without an ent_"),
-        ("ppo.imitation_coef=-1", "'ppo.imitation_coef' must be at least 0, and 0 without an ent_"),
+        ("ppo.gait_ent_coef=-1", "'ppo.gait_ent_coef' must be at least 0, not -1"),
+        ("ppo.imitation_coef=-1", "'ppo.imitation_coef' must be at least 0, not -1"),
     ):
         assert train_high.main(["--set", setting, "--out", str(empty)]) == 2
         assert capsys.readouterr().err.startswith(f"train_high.py: {message}")
     assert not empty.exists()
 
 
+def test_a_run_that_cannot_begin_leaves_its_folder_free(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "run")]
+    assert train_low.main([*out, "--n-envs", "1", "--workers", "2"]) == 2
+    assert "workers must be 1 to the 1 robots, not 2" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+def test_flags_come_after_a_preset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path)]
+    preset = ["--preset", "paper", "--seed", "7", "--n-envs", "4", "--workers", "1"]
+    small = ["--steps", "96", "--set", "ppo.lstm=8", "--time-limit", "0"]
+    assert train_high.main([*preset, *small, *out]) == 0
+    config = json.loads((tmp_path / "config.json").read_text(encoding="utf-8"))
+    assert (config["seed"], config["n_envs"], config["steps"]) == (7, 4, 96)
+    assert (config["env"]["decimation"], config["ppo"]["lstm"]) == (1, 8)
+    for flags in (["--preset", "paper"], ["--no-teacher"], ["--init", "x"]):
+        assert train_high.main(["--resume", *flags, *out]) == 2
+        assert "train_high.py: --resume goes on " in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        train_high.main(["--no-teacher", "--preset", "paper", *out])
+
+
+def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_low.main(["--device", "toaster", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("train_low.py: --device toaster: Expected one of ")
+    if not th.cuda.is_available():
+        assert train_low.main(["--device", "cuda", "--out", str(tmp_path)]) == 2
+        error = capsys.readouterr().err
+        assert error == "train_low.py: --device cuda: PyTorch finds no GPU here\n"
+
+
 def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as there are cores and robots for them; a run goes on with as many as it began."""
     parser = argparse.ArgumentParser()
-    add_arguments(parser, str(tmp_path), LowTrainConfig())
+    add_arguments(parser, str(tmp_path), LowTrainConfig(), "control steps")
 
     def workers(*flags: str) -> int:
         return configure(LowTrainConfig(), parser.parse_args(flags)).workers

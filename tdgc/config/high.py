@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from tdgc.config.settings import Count, NotNegative, Positive, Share, Whole
 from tdgc.config.sim import CommandRanges, RandomisationConfig
 
 
@@ -26,14 +27,14 @@ class HighRewardConfig:
     contact_force: float = -0.01
     laziness: float = -0.5
     alive: float = 0.1
-    map_radius: float = 8.0  # m, R_map: the tile's length
+    map_radius: Positive = 8.0  # m, R_map: the tile's length
     curve_gain: float = 1.0  # a of the goal distance
     curve_rate: float = 3.0  # b of the goal distance
-    goal_radius: float = 0.5  # m, d_0: the paper's reach distance
+    goal_radius: Positive = 0.5  # m, d_0: the paper's reach distance
     arrive_base: float = 1.0  # b_0
     arrive_speed: float = 2.0  # b_1: what an early arrival adds
     joint_speed_weight: float = 0.05  # beta of eta_t
-    height_scale: float = 0.01  # m^2, sigma_z
+    height_scale: Positive = 0.01  # m^2, sigma_z
     force_threshold: float = 1.0  # N, F_th
     lazy_speed: float = 0.1  # m/s, v_th
 
@@ -45,7 +46,7 @@ _GAITS: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = ("trot", "pronk"
 class HighLevelConfig:
     """The decision-level MDP (Sec. IV-B) and its curriculum (Sec. IV-C)."""
 
-    decimation: int = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
+    decimation: Count = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
     cues: Literal["both", "semantic", "geometric", "none"] = "both"
     # Gaits that the gait channel chooses from, in equal shares of its range.
     gaits: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = field(
@@ -66,10 +67,10 @@ class HighLevelConfig:
     closing_speed: bool = field(default=True, metadata={"before": False})
     # Share of the robots in training that are told an unknown family, so that the probes alone have
     # to do: tiles of several families, or of none that has a name.
-    unknown_share: float = 0.2
+    unknown_share: Share = 0.2
     # Trenches, which are leapt to a few centimetres, take twice the robots of the others.
     families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "gap", "tilt")
-    levels: int = 11  # L_max: levels 0..10
+    levels: Count = 11  # L_max: levels 0..10
     # How levels are chosen in training: by each robot's performance, as the paper has it; drawn
     # uniformly for each episode; or always the hardest.
     curriculum: Literal["performance", "uniform", "hardest"] = field(
@@ -77,15 +78,15 @@ class HighLevelConfig:
     )
     # m: in training trenches are this deep on level 0 and deepen from there, see
     # ``tdgc.tasks.tiles.shallow``; null: all of them are as deep as in the benchmark.
-    shallowest_trench: float | None = field(default=None, metadata={"before": None})
-    window: int = 4  # W episodes: short, since an episode of every robot takes minutes on two cores
-    threshold: int = 3  # S successes of them
+    shallowest_trench: Positive | None = field(default=None, metadata={"before": None})
+    window: Count = 4  # W episodes: few, since one of every robot takes minutes on two cores
+    threshold: Count = 3  # S successes of them
     # Robots begin spread over ``first_levels`` levels, of which ``first_level`` is the lowest.
-    first_level: int = field(default=0, metadata={"before": 0})
-    first_levels: int = 1
-    episode_seconds: float = 20.0  # T_max (benchmark)
-    hold_seconds: float = 2.0  # an episode goes on that long after the goal was reached
-    action_limit: float = 1.0  # a_max of the decoder
+    first_level: Whole = field(default=0, metadata={"before": 0})
+    first_levels: Count = 1
+    episode_seconds: Positive = 20.0  # T_max (benchmark)
+    hold_seconds: NotNegative = 2.0  # an episode goes on that long after the goal was reached
+    action_limit: Positive = 1.0  # a_max of the decoder
     # The decoder's bounds; all that the low policy was trained on where there are none.
     commands: CommandRanges | None = None
     rewards: HighRewardConfig = field(default_factory=HighRewardConfig)

@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
-from tdgc.config.settings import GaitShares, Range, Share
+from tdgc.config.settings import Count, GaitShares, NotNegative, Positive, Range, Share
 from tdgc.config.sim import CommandRanges, PhysicsConfig, RandomisationConfig, RobotConfig
 
 
@@ -43,8 +43,8 @@ class LowRewardConfig:
     power: float = -1.0
     # sigma_lin, sigma_yaw of the paper: Walk These Ways has 0.25 for both and weights
     # of 1 and 0.5; with those the policy undershot: it walked at 0.3-0.8 of the commanded velocity.
-    sigma_lin: float = 0.1  # m^2/s^2
-    sigma_yaw: float = 0.15  # rad^2/s^2
+    sigma_lin: Positive = 0.1  # m^2/s^2
+    sigma_yaw: Positive = 0.15  # rad^2/s^2
     # Share of the penalties that counts once a gait follows commands over its full ranges: all of
     # them teach the gait, but then they ask for walking slower than told (docs/experiments.md).
     walking_penalty: float = field(default=0.5, metadata={"before": 1.0})
@@ -70,8 +70,8 @@ class CommandDrawConfig:
     # Free commands that a robot fell at before. Most lead to no fall, so what is left to learn is
     # rare: a third of the robots that walked backward in slow trot fell over within six seconds.
     retries: Share = field(default=0.15, metadata={"before": 0.0})
-    growth: float = 0.05  # of the whole ranges, when a gait was tracked well
-    growth_steps: int = 200  # control steps of all robots, 4 s, after which a gait is judged
+    growth: Share = 0.05  # of the whole ranges, when a gait was tracked well
+    growth_steps: Count = 200  # control steps of all robots, 4 s, after which a gait is judged
     # Shares of what perfect tracking earns: errors of about 0.26 m/s and 0.32 rad/s at the default
     # sigmas.
     growth_velocity: Share = 0.5
@@ -100,9 +100,9 @@ class CrossingConfig:
     # 0 and 1. With feet below 9 cm a third crossed level 0 of Gap where all did above 16 cm.
     clearance: tuple[float, float] = (0.05, 0.15)
     bend: Share = 0.3  # of the pitch and roll ranges at difficulty 1
-    leap_decimation: int = 5  # control steps between two decisions on a leap: as the high policy's
-    landing_rate: float = 0.002  # of a landing in what is known of them: the last 500 count
-    shallowest_trench: float = 0.05  # m deep on level 0, see ``tdgc.tasks.tiles.shallow``
+    leap_decimation: Count = 5  # control steps between decisions on a leap: the high policy's
+    landing_rate: Share = 0.002  # of a landing in what is known of them: the last 500 count
+    shallowest_trench: Positive = 0.05  # m deep on level 0, see ``tdgc.tasks.tiles.shallow``
     demotion: Share = 0.5  # of the tile; who gets less far goes down a level (legged_gym)
 
 
@@ -111,16 +111,16 @@ class LowLevelConfig:
     """The execution-level MDP (Sec. IV-A)."""
 
     terrain: Literal["plane", "tiles"] = "plane"
-    levels: int = 11  # of the curriculum: 0..levels-1
+    levels: Count = 11  # of the curriculum: 0..levels-1
     # Robots begin spread over levels 0..first_levels-1.
-    first_levels: int = field(default=3, metadata={"before": 3})
+    first_levels: Count = field(default=3, metadata={"before": 3})
     # Pillar is left out: a policy that sees no obstacle can learn nothing of it but bumps. Stairs
     # and trenches, twice as many, are what it is still learning when slopes are easy.
     families: tuple[str, ...] = ("stair", "stair", "gap", "gap", "tilt", "rough")
-    episode_seconds: float = 20.0
-    command_seconds: float = 2.5  # a new command and gait that often
+    episode_seconds: Positive = 20.0
+    command_seconds: NotNegative = 2.5  # a new command and gait that often
     gyro: bool = True  # adds the angular velocity of the base to the actor's observation
-    command_start: float = 0.4  # share of the velocity ranges at the start of the curriculum
+    command_start: Share = 0.4  # share of the velocity ranges at the start of the curriculum
     robot: RobotConfig = field(default_factory=RobotConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     commands: CommandRanges = field(default_factory=CommandRanges)

@@ -10,16 +10,33 @@ import math
 import reprlib
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from tdgc.errors import InputError
 
-Range = typing.Annotated[tuple[float, float], "low <= high"]
-Share = typing.Annotated[float, "0 to 1"]
+#: Types of settings: what a value must be beside of that type stands in the error message.
+Range = typing.Annotated[tuple[float, float], "[low, high] with low <= high"]
+PositiveRange = typing.Annotated[tuple[float, float], "[low, high] with 0 < low <= high"]
+Share = typing.Annotated[float, "from 0 to 1"]
+Positive = typing.Annotated[float, "above 0"]
+NotNegative = typing.Annotated[float, "at least 0"]
+Whole = typing.Annotated[int, "at least 0"]
+Count = typing.Annotated[int, "at least 1"]
 #: Of trot, pronk, pace and bound.
-GaitShares = typing.Annotated[tuple[Share, Share, Share, Share], "1 together"]
+GaitShares = typing.Annotated[tuple[Share, Share, Share, Share], "shares that add up to 1"]
+
+_HOLDS: dict[Any, Callable[[Any], bool]] = {
+    Range: lambda bounds: bounds[0] <= bounds[1],
+    PositiveRange: lambda bounds: 0.0 < bounds[0] <= bounds[1],
+    Share: lambda share: 0.0 <= share <= 1.0,
+    Positive: lambda number: number > 0.0,
+    NotNegative: lambda number: number >= 0.0,
+    Whole: lambda number: number >= 0,
+    Count: lambda number: number >= 1,
+    GaitShares: lambda shares: math.isclose(sum(shares), 1.0),
+}
 
 
 class ConfigError(InputError):
@@ -152,6 +169,10 @@ def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
         if not dataclasses.is_dataclass(child):
             raise ConfigError(f"'{full}': '{head}' is a value, it has no keys of its own")
         return dataclasses.replace(config, **{head: _replace(child, rest, value, full)})
+    if dataclasses.is_dataclass(child) and isinstance(value, dict):  # its other keys stay
+        for key, own in value.items():
+            child = _replace(child, [key], own, f"{full}.{key}")
+        return dataclasses.replace(config, **{head: child})
     hint = typing.get_type_hints(type(config), include_extras=True)[head]
     return dataclasses.replace(config, **{head: _coerce(hint, value, full)})
 
@@ -161,13 +182,10 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
     origin = typing.get_origin(hint)
     shown = reprlib.repr(value)  # short, whatever the file holds
     if origin is typing.Annotated:
-        checked = _coerce(typing.get_args(hint)[0], value, path)
-        if hint == Range and checked[0] > checked[1]:
-            raise ConfigError(f"'{path}' must be [low, high] with low <= high, not {shown}")
-        if hint == Share and not 0.0 <= checked <= 1.0:
-            raise ConfigError(f"'{path}' must be from 0 to 1, not {shown}")
-        if hint == GaitShares and not math.isclose(sum(checked), 1.0):
-            raise ConfigError(f"'{path}' must add up to 1, not {shown}")
+        kind, rule = typing.get_args(hint)
+        checked = _coerce(kind, value, path)
+        if not _HOLDS[hint](checked):
+            raise ConfigError(f"'{path}' must be {rule}, not {shown}")
         return checked
     if origin is Literal:
         if value not in typing.get_args(hint):

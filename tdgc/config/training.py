@@ -5,6 +5,7 @@ from typing import Literal
 
 from tdgc.config.high import HighLevelConfig
 from tdgc.config.low import LowLevelConfig
+from tdgc.config.settings import Count, NotNegative, Positive, Share, Whole
 
 
 @dataclass(frozen=True)
@@ -13,22 +14,22 @@ class PPOConfig:
 
     # Times the mean standard deviation of the actions: as exploration shrinks, the same step of the
     # mean moves the policy further (the clipped share rose from 0.2 to 0.4 at a constant rate).
-    learning_rate: float = 6e-4
-    final_learning_rate: float = 1e-5  # reached linearly at the last step
-    n_steps: int = 32  # control steps a robot between updates
-    batch_size: int = 960  # a quarter of a rollout
-    n_epochs: int = 5
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_range: float = 0.2
-    ent_coef: float = 0.0005
-    vf_coef: float = 0.5
-    max_grad_norm: float = 1.0
-    initial_std: float = 1.0
+    learning_rate: Positive = 6e-4
+    final_learning_rate: Positive = 1e-5  # reached linearly at the last step
+    n_steps: Count = 32  # control steps a robot between updates
+    batch_size: Count = 960  # a quarter of a rollout
+    n_epochs: Count = 5
+    gamma: Share = 0.99
+    gae_lambda: Share = 0.95
+    clip_range: Positive = 0.2
+    ent_coef: NotNegative = 0.0005
+    vf_coef: NotNegative = 0.5
+    max_grad_norm: Positive = 1.0
+    initial_std: Positive = 1.0
     # SB3's 1e-5 swallows the critic's gradients: rewards carry dt and are below 0.03 a step.
-    adam_eps: float = 1e-8
-    actor: tuple[int, ...] = (256, 192)
-    critic: tuple[int, ...] = (256, 128)
+    adam_eps: Positive = 1e-8
+    actor: tuple[Count, ...] = (256, 192)
+    critic: tuple[Count, ...] = (256, 128)
     activation: Literal["elu", "relu", "tanh"] = "elu"
     mirror: bool = True  # policy and value exactly left-right symmetric
 
@@ -37,23 +38,23 @@ class PPOConfig:
 class CalibrationConfig:
     """Calibration of the low policy (``tdgc.calibration``), the end of a run of train_low.py."""
 
-    robots: int = 4800  # that walk to be measured; 0 leaves the policy as it is
-    turns: int = 60  # of 60 control steps each, in which the copy learns
+    robots: Whole = 4800  # that walk to be measured; 0 leaves the policy as it is
+    turns: Count = 60  # of 60 control steps each, in which the copy learns
 
 
 @dataclass(frozen=True)
 class LowTrainConfig:
     """A run of train_low.py: robots on a plane and on terrain, then calibration."""
 
-    seed: int = 42  # the paper's
-    n_envs: int = 120
-    workers: int = 2
-    steps: int = 36_000_000  # of reinforcement learning, altogether
+    seed: Whole = 42  # the paper's
+    n_envs: Count = 120
+    workers: Count = 2
+    steps: Count = 36_000_000  # of reinforcement learning, altogether
     # Of the robots, on the plane, where a step costs less than half of one on a tile; the others
     # cross tiles.
-    plane_share: float = 0.6
-    log_steps: int = 100_000
-    checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
+    plane_share: Share = 0.6
+    log_steps: Count = 100_000
+    checkpoint_seconds: NotNegative = 30.0  # with the update under way, less than a minute is lost
     env: LowLevelConfig = field(default_factory=LowLevelConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     calibration: CalibrationConfig = field(
@@ -67,49 +68,49 @@ class RecurrentPPOConfig:
 
     # With a deviation of 0.1 in all actions two fifths of the samples were clipped above 3e-4, and
     # the less noise, the sooner.
-    learning_rate: float = 1.5e-4
-    final_learning_rate: float = 5e-5  # reached linearly at the last step
-    n_steps: int = 24  # decisions a robot between updates
-    minibatches: int = 4
-    n_epochs: int = 5
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_range: float = 0.2
-    ent_coef: float = 1e-4
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
+    learning_rate: Positive = 1.5e-4
+    final_learning_rate: Positive = 5e-5  # reached linearly at the last step
+    n_steps: Count = 24  # decisions a robot between updates
+    minibatches: Count = 4
+    n_epochs: Count = 5
+    gamma: Share = 0.99
+    gae_lambda: Share = 0.95
+    clip_range: Positive = 0.2
+    ent_coef: NotNegative = 1e-4
+    vf_coef: NotNegative = 0.5
+    max_grad_norm: Positive = 0.5
     # On tiles of Gap a teacher whose timing is exact reached 91 % of its goals; with this noise 88,
     # with 0.1 in all other actions 79, and with 0.1 in the gait, too, 57 %: a gait is 0.5 wide, so
     # that it changes once in a hundred decisions, and a leap in another gait ends in the trench.
-    initial_std: float = 0.06
-    initial_gait_std: float = 0.04  # of the gait channel: changes none
+    initial_std: Positive = 0.06
+    initial_gait_std: Positive = 0.04  # of the gait channel: changes none
     # Decisions that the noise of the gait channel is held for, within an episode: what a gait is
     # worth shows in a second, not in a tenth of one.
-    gait_hold: int = field(default=1, metadata={"before": 1})
+    gait_hold: Count = field(default=1, metadata={"before": 1})
     # Bonus on the entropy of the gait alone, which falls linearly to nothing at the last step.
-    gait_ent_coef: float = field(default=0.0, metadata={"before": 0.0})
+    gait_ent_coef: NotNegative = field(default=0.0, metadata={"before": 0.0})
     # Weight of the imitation's loss beside PPO's, where imitation came first.
-    imitation_coef: float = field(default=10.0, metadata={"before": 0.0})
+    imitation_coef: NotNegative = field(default=10.0, metadata={"before": 0.0})
     # Units of both LSTMs; null for a feed-forward policy. With 128 units each an update takes twice
     # as long, and what is learned is no better.
-    lstm: int | None = 64
+    lstm: Count | None = 64
     mirror: bool = True  # policy and value exactly left-right symmetric
-    actor: tuple[int, ...] = (64,)
-    critic: tuple[int, ...] = (64,)
+    actor: tuple[Count, ...] = (64,)
+    critic: tuple[Count, ...] = (64,)
 
 
 @dataclass(frozen=True)
 class ImitationConfig:
     """Imitation of the scripted teacher, with which a run of train_high.py begins."""
 
-    steps: int = 640_000  # decisions altogether; 0 leaves everything to reinforcement learning
-    learning_rate: float = 2e-3
-    final_learning_rate: float = 2e-4  # reached linearly at the last of the steps
+    steps: Whole = 640_000  # decisions altogether; 0 leaves everything to reinforcement learning
+    learning_rate: Positive = 2e-3
+    final_learning_rate: Positive = 2e-4  # reached linearly at the last of the steps
     # How little a frequency costs more than the teacher's depends on the updates that there were:
     # 0.19, 0.15 and 0.12 after 1, 4 and 10 thousand of them on the same 90,000 decisions
     # (docs/experiments.md). An update takes a tenth of the time of the decisions behind it.
-    n_epochs: int = 16
-    minibatches: int = field(default=8, metadata={"before": 4})
+    n_epochs: Count = 16
+    minibatches: Count = field(default=8, metadata={"before": 4})
     # How levels are chosen meanwhile, as ``env.curriculum`` has it afterwards: what the teacher
     # shows needs no easy beginning, and the hardest levels are where a student has most to learn.
     curriculum: Literal["performance", "uniform", "hardest"] = field(
@@ -124,15 +125,15 @@ class ImitationConfig:
 class HighTrainConfig:
     """A run of train_high.py."""
 
-    seed: int = 42
-    n_envs: int = 100
-    workers: int = 2
-    steps: int = 2_100_000  # decisions altogether: an hour of two cores
-    log_steps: int = 24_000
-    checkpoint_seconds: float = 30.0  # with the update under way, less than a minute is lost
+    seed: Whole = 42
+    n_envs: Count = 100
+    workers: Count = 2
+    steps: Count = 2_100_000  # decisions altogether: an hour of two cores
+    log_steps: Count = 24_000
+    checkpoint_seconds: NotNegative = 30.0  # with the update under way, less than a minute is lost
     start_speed: float = 0.5  # m/s: before any training it walks straight on in the default gait
     # m, of its feet then; 0.08 is the default of Walk These Ways.
-    start_swing: float = field(default=0.08, metadata={"before": 0.08})
+    start_swing: NotNegative = field(default=0.08, metadata={"before": 0.08})
     # The low policy: by default what train_low.py left in runs/low, or else the shipped one.
     low: str | None = None
     env: HighLevelConfig = field(default_factory=HighLevelConfig)

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+import torch as th
+
 from tdgc.config import ConfigError, read_json, recorded, to_dict, with_overrides
 from tdgc.config.settings import Config
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
@@ -10,19 +12,19 @@ from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.worker import MakeLink, ProcessLink
 
 
-def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config) -> None:
-    """The flags of both trainers; ``out`` is the default run folder, and ``config`` says what else
-    is default."""
+def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, unit: str) -> None:
+    """The flags of both trainers; ``out`` is the default run folder, ``config`` says what else is
+    default, and ``unit`` what a step of the run is."""
     default = to_dict(config)
     training = parser.add_argument_group("training")
-    training.add_argument("--steps", type=int, help=f"steps altogether ({default['steps']})")
+    training.add_argument("--steps", type=int, help=f"{unit} altogether ({default['steps']})")
     training.add_argument("--n-envs", type=int, help=f"number of robots ({default['n_envs']})")
-    training.add_argument("--seed", type=int, help=f"of all randomness ({default['seed']})")
+    training.add_argument("--seed", type=int, help=f"random seed ({default['seed']})")
     training.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
-        help="change the configuration, e.g. ppo.n_steps=48; may be repeated",
+        help="override a setting of tdgc/config, e.g. ppo.n_epochs=4; may be repeated",
     )  # fmt: skip
-    training.add_argument("--init", type=Path, help="start from this policy (from scratch)")
+    training.add_argument("--init", type=Path, help="start from this policy instead of from scratch")
     run = parser.add_argument_group("run")
     run.add_argument("--out", type=Path, default=Path(out), help=f"run folder ({out})")
     run.add_argument("--resume", action="store_true", help="continue the run in --out")
@@ -37,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config) -> 
         "--worker-timeout", type=float, default=300.0, metavar="S",
         help="restart a worker that is silent for S seconds (300)",
     )  # fmt: skip
-    machine.add_argument("--device", default="cpu", help="where the networks learn (cpu)")
+    machine.add_argument("--device", default="cpu", help="PyTorch device of the learner (cpu)")
     machine.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
 
 
@@ -47,11 +49,16 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     With ``--cluster`` this process joins it.
 
     Raises:
-        ConfigError: nothing to resume, a folder in use, or an assignment that cannot be used.
+        ConfigError: nothing to resume, a folder in use, or a flag that cannot be used.
         ClusterError: a cluster that cannot be used, or has fewer CPUs than there are workers.
     """
     stored = args.out / "config.json"
+    if not args.worker_timeout > 0.0:
+        raise ConfigError(f"--worker-timeout must be above 0, not {args.worker_timeout:g}")
+    check_device(args.device)
     if args.resume:
+        if args.init is not None:
+            raise ConfigError("--resume goes on with the policy of its run: no --init")
         if not stored.is_file():
             raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
         try:
@@ -74,6 +81,20 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     if args.cluster is not None:
         check_workers(workers, cores)
     return config
+
+
+def check_device(name: str) -> None:
+    """See that PyTorch has the device; SB3 would take the CPU for a GPU that is not there.
+
+    Raises:
+        ConfigError: it has not.
+    """
+    try:
+        kind = "cpu" if name == "auto" else th.device(name).type
+        if kind == "cuda" and not th.cuda.is_available():
+            raise RuntimeError("PyTorch finds no GPU here")
+    except RuntimeError as error:
+        raise ConfigError(f"--device {name}: {str(error).splitlines()[0]}") from None
 
 
 def worker_link(args: argparse.Namespace) -> MakeLink:

@@ -28,6 +28,7 @@ from tqdm import tqdm
 
 from tdgc import policies
 from tdgc.config import HighTrainConfig, LowTrainConfig, to_dict
+from tdgc.files import atomic
 from tdgc.learn.checkpoints import Checkpoint
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import MakeLink, WorkerError, memory_mb
@@ -117,8 +118,6 @@ class Run:
         if self.init is not None:
             policies.load(self.init)  # before anything is written
         self.folder.mkdir(parents=True, exist_ok=True)
-        config = json.dumps(to_dict(self.config), indent=2)
-        (self.folder / "config.json").write_text(config, encoding="utf-8")
         unsaved: OSError | None = None
         for number, phase in enumerate(phases):
             if last is not None and last.steps >= phase.until:
@@ -154,6 +153,9 @@ class Run:
                 if self.init is not None:
                     policies.load_into(self.init, model.policy)
                 env.reset()
+            self._write_config()  # of a run that has begun: what cannot begin leaves none behind
+            if last is not None:
+                drop_rows_after(last.steps, self.folder / "log.jsonl")
             # What the robots saw last, as after a rollout of this learner.
             model._last_obs, model._last_episode_starts = env.seen(), env.starts()
             model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
@@ -171,6 +173,10 @@ class Run:
             return taken, finished, callback.unsaved
         finally:
             env.close()
+
+    def _write_config(self) -> None:
+        with atomic(self.folder / "config.json") as path:
+            path.write_text(json.dumps(to_dict(self.config), indent=2), encoding="utf-8")
 
 
 class RunCallback(BaseCallback):
@@ -328,6 +334,21 @@ def append_line(path: Path, line: str) -> None:
         if file.write(data) < len(data):  # the disk had room for a part
             file.truncate(end)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+def drop_rows_after(steps: int, path: Path) -> None:
+    """Drop rows of a log beyond ``steps``: a run that was killed writes them again.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    if not path.exists():
+        return
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    kept = [line for line in lines if json.loads(line)["steps"] <= steps]
+    if len(kept) < len(lines):
+        with atomic(path) as file:
+            file.write_text("".join(kept), encoding="utf-8")
 
 
 def learn(model: Any, callback: RunCallback, until: int) -> bool:

@@ -1,21 +1,43 @@
 """Independent jobs, such as batches of episodes, shared among processes of this machine."""
 
 import multiprocessing as mp
+import signal
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Protocol, TypeVar
 
-from tdgc.parallel.worker import keep_memory, one_blas_thread
+from tdgc.parallel.worker import WorkerError, end_with_parent, keep_memory, one_blas_thread
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
 def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    """``work`` on each job, in order, on ``workers`` processes at most."""
-    processes = min(workers, len(jobs))
+    """``work`` on each job, in order, on ``workers`` processes at most.
+
+    Raises:
+        WorkerError: a process died.
+        Exception: what ``work`` raised.
+    """
+    processes, others = min(workers, len(jobs)), set(mp.active_children())
     spawn = mp.get_context("spawn")
-    with one_blas_thread(), spawn.Pool(processes, initializer=keep_memory) as pool:
-        yield from pool.imap(work, jobs)
+    with one_blas_thread(), ProcessPoolExecutor(processes, spawn, _begin) as pool:
+        try:
+            yield from pool.map(work, jobs)
+        except BrokenProcessPool:
+            raise WorkerError("a process died, perhaps for want of memory") from None
+        except BaseException:  # the jobs under way are wanted by nobody
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(mp.active_children()) - others:
+                process.terminate()
+            raise
+
+
+def _begin() -> None:
+    keep_memory()
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that shares the jobs
 
 
 class RunJobs(Protocol):

@@ -242,12 +242,16 @@ def memory_mb(pid: int) -> float:
 # ---------------------------------------------------------------------------- its process
 
 
-def _end_with_parent() -> None:
-    """End this process when its parent has, whatever it is busy with."""
+def end_with_parent() -> None:
+    """Let this process end when its parent has, whatever it is busy with."""
     parent = mp.parent_process()
     assert parent is not None
-    parent.join()
-    os._exit(1)
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _serve(pipe: Connection, beginning: Beginning) -> None:
@@ -255,7 +259,7 @@ def _serve(pipe: Connection, beginning: Beginning) -> None:
     # What a terminal or a batch system sends to all processes is the parent's to answer.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     worker: Worker | None = None
     try:
         views = beginning.views()

@@ -38,23 +38,39 @@ _FREQUENCY = INDEX["frequency"]
 _HISTORY = 3  # control steps of targets kept: the step, and two before for latency up to 40 ms
 
 
-def check_latency(config: RandomisationConfig, physics: PhysicsConfig) -> None:
-    """See that latencies are no longer than the time for which joint targets are kept.
+def check_randomisation(
+    config: RandomisationConfig, physics: PhysicsConfig, trunk_mass: float
+) -> None:
+    """See that what is drawn is physical, and latencies no longer than joint targets are kept.
+
+    Args:
+        config: what is drawn, ``scale`` included.
+        physics: has the nominal friction, and the time of a control step.
+        trunk_mass: kg.
 
     Raises:
-        ConfigError: says what is allowed.
+        ConfigError: a range that is not; says what is allowed.
     """
-    kept = (_HISTORY - 1) * physics.control_dt
-    shortest, longest = config.scale * config.latency[0], config.scale * config.latency[1]
-    if shortest < 0.0 or longest > kept:
-        raise ConfigError(
-            f"'randomisation.latency' times its scale must be from 0 to {kept:g} s, not "
-            f"{shortest:g} to {longest:g}"
-        )
+    kept, any_more = (_HISTORY - 1) * physics.control_dt, float("inf")
+    allowed = {  # nominal value, least and greatest
+        "friction": (physics.friction, 0.0, any_more),
+        "payload": (0.0, -0.9 * trunk_mass, any_more),  # Bullet wants some mass to be left
+        "motor_strength": (1.0, 0.0, any_more),
+        "latency": (0.0, 0.0, kept),
+        "armature": (0.0, 0.0, any_more),
+        "joint_friction": (0.0, 0.0, any_more),
+    }
+    for name, (nominal, least, greatest) in allowed.items():
+        low, high = (nominal + config.scale * (b - nominal) for b in getattr(config, name))
+        if low < least or high > greatest:
+            raise ConfigError(
+                f"'randomisation.{name}' times its scale must be from {least:g} to {greatest:g}, "
+                f"not [{low:g}, {high:g}]"
+            )
 
 
 class Locomotion:
-    """M robots that take 12 actions each 20 ms and follow 15 commands.
+    """M robots that take 12 actions each control step and follow 15 commands.
 
     They are in a new Bullet world, or in ``world`` if there is one.
 
@@ -174,10 +190,10 @@ class Locomotion:
         ``width`` (n,) scales each robot's ranges, as ``config.scale`` does all.
 
         Raises:
-            ConfigError: as ``check_latency``.
+            ConfigError: as ``check_randomisation``.
         """
         n = len(index)
-        check_latency(config, self.physics)
+        check_randomisation(config, self.physics, self.world.state.geometry.trunk_mass)
         scale = np.broadcast_to(config.scale * np.asarray(width), n)
 
         def draw(bounds: Range, nominal: float, shape: tuple[int, ...] = (n,)) -> Array:

@@ -469,7 +469,7 @@ class TileField:
         self.heights: HeightArray = np.zeros((rows * TILE_SAMPLES, cols * self._width), np.float32)
         self.support: HeightArray = np.zeros_like(self.heights)
         self.starts, self.goals = np.zeros((rows, cols, 3)), np.zeros((rows, cols, 2))
-        self.features: dict[tuple[int, int], Features] = {}
+        self.features = {tile: Features() for tile in np.ndindex(rows, cols)}
 
     @property
     def extent(self) -> tuple[float, float]:

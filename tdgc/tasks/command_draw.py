@@ -56,7 +56,8 @@ class CommandDraw:
     ) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
         """Gaits (n,) and continuous commands (n, 12) from such ``bounds``, and which of them (n,)
         are tried again; of the ``free`` ones (n,) some leap, and some are what robots fell at. In
-        pronk the steps are at least as quick as ``leaps.LONGEST`` asks for."""
+        pronk the steps are at least as quick as ``leaps.LONGEST`` asks for, and the speed is what
+        the quickest of them allow."""
         n, rng, config = len(free), self._rng, self._config.command_draw
         gait = np.sum(rng.uniform(size=(n, 1)) > np.cumsum(gaits, axis=1)[:, :-1], axis=1)
         values = rng.uniform(low, high)
@@ -69,7 +70,9 @@ class CommandDraw:
         values[rng.uniform(size=n) < config.standing, :3] = 0.0
         pronk, frequency = gait == PRONK, INDEX["frequency"]
         least = np.hypot(values[pronk, 0], values[pronk, 1]) / LONGEST
-        values[pronk, frequency] = np.maximum(values[pronk, frequency], least)
+        slower = np.minimum(high[pronk, frequency] / np.maximum(least, 1e-9), 1.0)
+        values[pronk, :2] *= slower[:, None]
+        values[pronk, frequency] = np.maximum(values[pronk, frequency], slower * least)
         again = free & (rng.uniform(size=n) < config.retries)
         rows = self.falls[rng.integers(0, _FALLS, n)]
         again &= rows[:, 0] >= 0.0

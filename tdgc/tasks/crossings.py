@@ -28,6 +28,15 @@ _FREQUENCY, _LENGTH = INDEX["frequency"], INDEX["stance_length"]
 _CLEAR = 0.08
 
 
+def within(velocity: Array, low: Array, high: Array) -> Array:
+    """Velocities (M, 2) as fast as their bounds (2,) allow in their directions; a component that
+    must be zero is left out instead of ending all of the motion."""
+    bound = np.where(velocity < 0.0, -low, high)
+    free = bound > 0.0
+    over = np.where(free, np.abs(velocity) / np.where(free, bound, 1.0), 0.0)
+    return np.asarray(np.where(free, velocity, 0.0) / np.maximum(over.max(axis=1), 1.0)[:, None])
+
+
 class Crossings:
     """Steers M robots over their tiles.
 
@@ -41,6 +50,7 @@ class Crossings:
         flat: (M,) whose tiles are.
         leapers: (M,) whose tiles have trenches.
         landing: of the low policy as it is now, learned from its leaps.
+        spread: (M,) m, ``landing.spread`` as it was when each robot's leaps were planned.
     """
 
     def __init__(
@@ -57,12 +67,18 @@ class Crossings:
         self.leapers = np.array([family == "gap" for family in families])
         self._plan = LeapPlan(len(families), config.commands, _CLEAR)
         self.landing = Landing()
+        self.spread = np.zeros(len(families))
 
     def look(self, field: TileField, index: NDArray[np.integer]) -> None:
-        """Plan the leaps of the robots ``index`` (n,) over the trenches of their tiles."""
+        """Plan the leaps of the robots ``index`` (n,) over the trenches of their new tiles."""
+        self.spread[index] = self.landing.spread
+        self.plan(field, index)
+
+    def plan(self, field: TileField, index: NDArray[np.integer]) -> None:
+        """Plan the leaps of the robots ``index`` (n,), with the ``spread`` of when they looked."""
         for i in index[self.leapers[index]]:
             trenches = field.features[int(i), 0].trenches
-            self._plan.look(int(i), trenches, self.landing.spread)
+            self._plan.look(int(i), trenches, float(self.spread[i]))
 
     # ------------------------------------------------------------------ what is drawn
 
@@ -106,9 +122,14 @@ class Crossings:
         n, rng, c, e = len(index), self._rng, self._config, self._episodes
         leaps = e.crossing[index] & self.leapers[index] & (gait == PRONK)
         swing = INDEX["swing_height"]
-        values[leaps, swing] = rng.uniform(self._low[swing], SWING_HEIGHT, int(leaps.sum()))
-        values[leaps, INDEX["duration"]] = DURATION  # which landings are planned for
-        for j, usual in ((_FREQUENCY, SPEED / STRIDE), (_LENGTH, STRIDE)):  # until the first one
+        low = self._low[swing]
+        highest = np.clip(SWING_HEIGHT, low, self._high[swing])
+        values[leaps, swing] = rng.uniform(low, highest, int(leaps.sum()))
+        for j, usual in (
+            (INDEX["duration"], DURATION),  # which landings are planned for
+            (_FREQUENCY, SPEED / STRIDE),  # until the first of them is
+            (_LENGTH, STRIDE),
+        ):
             values[leaps, j] = np.clip(usual, self._low[j], self._high[j])
         e.leaping[index] = leaps
         e.follow[index] = np.where(leaps, 0.0, rng.uniform(size=n))
@@ -132,8 +153,7 @@ class Crossings:
         bearing = np.arctan2(offset[:, 1], offset[:, 0])
         direction = bearing - state.yaw
         velocity = e.speed[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-        over = np.abs(velocity) / self._high[:2]
-        velocity /= np.maximum(over.max(axis=1, keepdims=True), 1.0)
+        velocity = within(velocity, self._low[:2], self._high[:2])
         # A leap faces across the trenches, so that both feet of a pair land on one line.
         heading = np.where(e.leaping, 0.0, bearing + e.facing)
         turn = self._config.heading_gain * wrap_angle(heading - state.yaw)

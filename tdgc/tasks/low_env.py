@@ -308,7 +308,8 @@ class LowLevelTask:
         }  # fmt: skip
 
     def _under_way(self) -> dict[str, NDArray[Any]]:
-        return self.episodes.arrays() | {"gait_scores": self.commands.scores}
+        own = {"gait_scores": self.commands.scores, "spread": self.crossings.spread}
+        return self.episodes.arrays() | own
 
     def state_dict(self) -> State:
         """What was learned of the robots, and their ``episodes`` under way, as copies."""
@@ -344,7 +345,7 @@ class LowLevelTask:
         fill(self._under_way(), episodes)
         if self.tiles is not None:
             self.tiles.load_state_dict(episodes["tiles"])
-            self.crossings.look(self.tiles.field, np.arange(self.num_robots))
+            self.crossings.plan(self.tiles.field, np.arange(self.num_robots))
             self.locomotion.world.upload_terrain()
         self.locomotion.load_state_dict(episodes["locomotion"])
         self.ground = measure_ground(self.locomotion)
@@ -357,8 +358,9 @@ class LowLevelTask:
 def make_task(
     config: tuple[LowLevelConfig, LowLevelConfig], share: float, robots: int, seed: int
 ) -> Task:
-    """The robots of a worker: a share of them in the first MDP, the others in the second."""
-    first = round(share * robots)
+    """The robots of a worker: a share of them in the first MDP, the others, one at least, in the
+    second."""
+    first = min(round(share * robots), robots - 1)
     if not first:
         return LowLevelTask(config[1], robots, seed)
     seeds = np.random.SeedSequence(seed).generate_state(2)

@@ -35,10 +35,22 @@ def check_families(families: Sequence[str]) -> None:
     """See that tiles of the families can be made.
 
     Raises:
-        ValueError: an unknown name, or a height map that cannot be used.
+        ValueError: none, an unknown name, or a height map that cannot be used.
     """
+    if not families:
+        raise ValueError("'env.families' must name at least one terrain family")
     for family in families:
         check_family(family, (FLAT,))
+
+
+def check_levels(levels: int) -> None:
+    """See that there are so many levels to train on.
+
+    Raises:
+        ValueError: more than that; those above are the benchmark's, for what no policy has met.
+    """
+    if levels > MAX_LEVEL + 1:
+        raise ValueError(f"'env.levels' must be from 1 to {MAX_LEVEL + 1}, not {levels}")
 
 
 def shallow(tile: Tile, level: int, shallowest: float) -> Tile:

@@ -1,0 +1,45 @@
+"""Jobs shared among processes: in order, and no silence when one of them dies."""
+
+import os
+import time
+
+import pytest
+
+from tdgc.parallel.jobs import run_jobs
+from tdgc.parallel.worker import WorkerError
+
+
+def reciprocal(number: float) -> float:
+    time.sleep(0.2 if number == 1.0 else 0.0)  # the first is the last to be ready
+    return 1.0 / number
+
+
+def die(number: int) -> int:
+    if number == 2:
+        os._exit(9)  # as the kernel ends a process that takes too much memory
+    return number
+
+
+def sleep(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def test_results_come_in_the_order_of_the_jobs() -> None:
+    assert list(run_jobs(reciprocal, [1.0, 2.0, 4.0, 8.0], 2)) == [1.0, 0.5, 0.25, 0.125]
+
+
+def test_what_a_job_raises_is_raised() -> None:
+    with pytest.raises(ZeroDivisionError):
+        list(run_jobs(reciprocal, [1.0, 0.0], 1))
+
+
+def test_a_process_that_dies_is_told() -> None:
+    with pytest.raises(WorkerError, match=r"^a process died, perhaps for want of memory$"):
+        list(run_jobs(die, range(4), 2))
+
+
+def test_who_wants_no_more_results_waits_for_none() -> None:
+    results = run_jobs(sleep, [0.0, 1000.0], 2)
+    assert next(results) == 0.0
+    results.close()
