@@ -30,6 +30,7 @@ from tdgc.sim.robot import (
     quaternion_product,
     rotation_matrix,
     stance_load,
+    to_world,
     walking_pose,
     wrap_angle,
     yaw_quaternion,
@@ -490,3 +491,11 @@ def test_left_and_right_are_mirror_images() -> None:
             for one, other in zip(left.iter("origin"), right.iter("origin"), strict=True):
                 x, y, z = numbers(one.attrib["xyz"])
                 assert numbers(other.attrib["xyz"]) == [x, -y, z]
+
+
+def test_points_of_heading_frames_in_the_world() -> None:
+    """Ahead of a robot that looks to the left is +y, and to its left -x."""
+    xy, yaw = np.array([[1.0, 2.0], [3.0, 0.0]]), np.array([0.5 * math.pi, math.pi])
+    x, y = to_world(xy, yaw, np.array([[0.3, 0.0], [0.0, 0.1]]))
+    np.testing.assert_allclose(x, [[1.0, 0.9], [2.7, 3.0]])
+    np.testing.assert_allclose(y, [[2.3, 2.0], [0.0, -0.1]], atol=1e-12)

@@ -431,7 +431,6 @@ def test_grid_rows_are_levels_and_columns_families(grid):
     assert grid.shape == (2, 3)
     assert grid.heights.shape == grid.support.shape == (322, 483)
     assert grid.heights.dtype == np.float32 and grid.heights.flags.c_contiguous
-    assert grid.extent == (pytest.approx(16.05), pytest.approx(24.10))
     for row, level in enumerate((2, 7)):
         for col, family in enumerate(("stair", "rough", "mixed")):
             made = make_tile(family, level / 10, tile_rng(3, family, level, 0))
@@ -495,6 +494,12 @@ def test_height_at_follows_bullets_triangles():
     np.testing.assert_allclose(grid.support_at(x + 0.05 * u, y + 0.05 * v), 1, atol=1e-6)
     assert grid.height_at(x + 0.01, y + 0.02) == pytest.approx(expected[4], abs=1e-6)
     assert grid.height_at(np.full((5, 2), x), np.full((5, 2), y)).shape == (5, 2)
+
+
+def test_there_is_no_height_where_a_robot_that_blew_up_is(grid):
+    nan = math.nan
+    found = grid.height_at(np.array([nan, 1.0, nan, 1.0]), np.array([nan, nan, 1.0, 1.0]))
+    assert np.isnan(found).tolist() == [True, True, True, False]
 
 
 def test_height_at_hits_every_sample_and_clamps_outside(grid):

@@ -24,6 +24,7 @@ from tdgc.sim.robot import (
     joint_targets,
     nominal_height,
     nominal_pose,
+    to_world,
     walking_pose,
     yaw_quaternion,
 )
@@ -166,10 +167,7 @@ class Locomotion:
     def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:
         """Stand the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)
         rad, with their clocks at ``clock`` (n,), and forget their histories."""
-        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-        foot_x = xy[:, :1] + c * self._feet[..., 0] - s * self._feet[..., 1]
-        foot_y = xy[:, 1:] + s * self._feet[..., 0] + c * self._feet[..., 1]
-        ground = self.world.ground_height(foot_x, foot_y).max(axis=1)
+        ground = self.world.ground_height(*to_world(xy, yaw, self._feet)).max(axis=1)
         position = np.column_stack([xy, ground + self._stand])
         pose = np.tile(self.nominal, (len(index), 1))
         self.world.reset_robots(index, position, yaw_quaternion(yaw), pose)

@@ -275,6 +275,15 @@ def quaternion_product(one: Array, other: Array) -> Array:
     )
 
 
+def to_world(xy: Array, yaw: Array, points: Array) -> tuple[Array, Array]:
+    """x and y in the world, (M, n) m each, of ``points`` (n, 2) or (M, n, 2) m in the heading
+    frames of M robots at ``xy`` (M, 2) m and ``yaw`` (M,) rad."""
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x = xy[:, :1] + c * points[..., 0] - s * points[..., 1]
+    y = xy[:, 1:2] + s * points[..., 0] + c * points[..., 1]
+    return x, y
+
+
 def yaw_quaternion(yaw: Array) -> Array:
     """Quaternions (M, 4) of upright bodies with heading ``yaw`` (M,) rad."""
     zero = np.zeros_like(yaw)

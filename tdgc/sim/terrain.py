@@ -33,7 +33,7 @@ EDITION = 2
 # Families and levels: Sec. III-A; Mixed and the levels past 10 are only ever evaluated on.
 FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
 ALL_FAMILIES = (*FAMILIES, "mixed")
-#: A family whose name ends so is a file with heights of the user's own, see `height_map`.
+#: A family whose name ends so is a file with heights of the user's own, see ``height_map``.
 MAP_ENDING = ".npy"
 MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1
 OOD_LEVELS = (11, 12)  # out of distribution, d = 1.1 and 1.2
@@ -91,7 +91,7 @@ class Section(NamedTuple):
     """A stretch of the tile along x that one family fills, in m.
 
     The family's features lie in [begin, end]. Families that act on every sample rise from h = 0 at
-    `low` and are back at h = 0 at `high`: around the zone that adds the transition bands.
+    ``low`` and are back at h = 0 at ``high``: around the zone that adds the transition bands.
     """
 
     low: float
@@ -113,16 +113,12 @@ HALF_ZONES = (
 class Features:
     """What a tile is made of, in its frame and from the start to the goal.
 
-    Attributes
-    ----------
-    trenches : (k, 2) float64, m
-        x of both lips of each trench, where its walls meet the ground.
-    risers : (k, 2) float64, m
-        x of the middle of each riser, and how far the ground rises there (down is negative).
-    pillars : (k, 3) float64, m
-        x, y of the axis and diameter of each cylinder.
-    slope : float, rad
-        Lateral slope: positive where the ground rises to the left.
+    Attributes:
+        trenches: (k, 2) m, x of both lips of each trench, where its walls meet the ground.
+        risers: (k, 2) m, x of the middle of each riser, and how far the ground rises there (down is
+            negative).
+        pillars: (k, 3) m, x and y of the axis of each cylinder, and its diameter.
+        slope: rad, lateral: positive where the ground rises to the left.
     """
 
     trenches: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
@@ -144,24 +140,17 @@ class Features:
 class Tile:
     """One terrain tile in its own frame: sample [0, 0] at (0, 0).
 
-    Attributes
-    ----------
-    heights : (161, 161) float32, m
-        The collision surface h(x, y).
-    support : (161, 161) float32, m
-        The surface that the fall rule measures from: `heights` with trenches filled and pillars
-        taken away.
-    start : (3,) float64
-        x, y in m and yaw in rad.
-    goal : (2,) float64
-        x, y in m.
-    family : str
-    difficulty : float
-    parts : tuple of str
-        The families met along x: `(family,)`, or the two halves of Mixed.
-    features : Features
-        Its trenches, risers, pillars and slope.
-    cell : float, m
+    Attributes:
+        heights: (161, 161) m, the collision surface h(x, y).
+        support: (161, 161) m, the surface that the fall rule measures from: ``heights`` with
+            trenches filled and pillars taken away.
+        start: (3,), x, y in m and yaw in rad.
+        goal: (2,) m, x and y.
+        family: one of ``ALL_FAMILIES``, or the path of a height map.
+        difficulty: d.
+        parts: the families met along x: ``(family,)``, or the two halves of Mixed.
+        features: its trenches, risers, pillars and slope.
+        cell: m, the grid's resolution.
     """
 
     heights: HeightArray
@@ -193,6 +182,9 @@ def difficulty_parameter(family: str, difficulty: float) -> float:
     """Geometric parameter p(d) = p_min + d (p_max - p_min) of a family (Eq. 1).
 
     Mixed has none of its own: each of its halves uses its family's.
+
+    Raises:
+        ValueError: a family without a parameter, or a difficulty outside [0, 1.2].
     """
     if family not in FAMILIES:
         raise ValueError(f"{family!r} has no parameter; choose from {', '.join(FAMILIES)}")
@@ -216,14 +208,15 @@ def draw_start_goal(
 def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
     """Generate one tile.
 
-    Parameters
-    ----------
-    family : str
-        One of `ALL_FAMILIES`, or the path of a height map, whose heights are multiplied by d.
-    difficulty : float
-        d in [0, 1.2]: level / 10; the curriculum ends at 1.
-    rng : numpy Generator
-        The only source of chance: the same state gives the same tile.
+    Args:
+        family: one of ``ALL_FAMILIES``, or the path of a height map, whose heights are multiplied
+            by d.
+        difficulty: d in [0, 1.2], level / 10; the curriculum ends at 1.
+        rng: the only source of chance: the same state gives the same tile.
+
+    Raises:
+        ValueError: an unknown family, a height map that cannot be used, or a difficulty outside
+            [0, 1.2].
     """
     check_family(family)
     _check_difficulty(difficulty)
@@ -280,7 +273,7 @@ def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relie
 
 
 def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
-    """Cylinders on a flat base; a section gets its share of the whole zone's `count`.
+    """Cylinders on a flat base; a section gets its share of the whole zone's ``count``.
 
     A sample within a cylinder's radius is raised, so a wall leans outwards over one cell.
     """
@@ -295,7 +288,7 @@ def stair(section: Section, step_height: float, rng: np.random.Generator) -> Rel
     """As many steps up and as many down again as the section holds, a landing between.
 
     A riser climbs over a single cell, the steepest a grid can be, and the tread behind it is drawn
-    from `TREAD_CELLS`, its riser's cell included. What room is left is shared at random between
+    from ``TREAD_CELLS``, its riser's cell included. What room is left is shared at random between
     the ground before the first riser, the landing and the ground behind the last.
     """
     cells = _sample(section.end) - _sample(section.begin)
@@ -318,7 +311,7 @@ def stair(section: Section, step_height: float, rng: np.random.Generator) -> Rel
 
 
 def gap(section: Section, width: float, rng: np.random.Generator) -> Relief:
-    """Trenches across the whole tile, at random but `TRENCH_SPACING` apart.
+    """Trenches across the whole tile, at random but ``TRENCH_SPACING`` apart.
 
     Each lowers floor or ceil of w / cell samples, at random so that the mean width is w. As the
     walls lean over one cell on either side, a trench of n samples measures n - 1, n and n + 1 cells
@@ -394,8 +387,11 @@ def file_label(family: str) -> str:
 def place_pillars(section: Section, count: int, rng: np.random.Generator) -> FloatArray:
     """Centres and diameters (count, 3) in m of cylinders that keep their clearance.
 
-    One after the other at random among free places. If one finds none, all are drawn anew: even
+    One after the other at random among free places. If one finds none, all start over: even
     the 28 of level 12 take up no more than 40 % of the room, where random placing jams near 55 %.
+
+    Raises:
+        RuntimeError: no room for so many.
     """
     restarts, candidates = 100, 256  # ample: at level 12 one tile in 25 restarts, easier ones fewer
     for _ in range(restarts):
@@ -428,7 +424,11 @@ _ON_FLAT_BASE = ("pillar", "gap")
 def tile_rng(
     seed: int, family: str, level: int, index: int, stream: int = TRAIN_STREAM
 ) -> np.random.Generator:
-    """Generator of tile number `index` of a family and level; streams and tiles never share one."""
+    """Generator of tile number ``index`` of a family and level; streams and tiles never share one.
+
+    Raises:
+        ValueError: an unknown family, or a number outside [0, 2**32).
+    """
     check_family(family)
     entropy = (stream, int(seed), family_number(family), int(level), int(index))
     # Numbers of more than 32 bits would take two words and could then run into their neighbours.
@@ -441,20 +441,20 @@ class TileField:
     """Tiles side by side in one height field, (rows, cols) of them, rows along x.
 
     Tiles share no samples, so they repeat every 8.05 m. The world frame has sample [0, 0] at
-    (0, 0); a tile's frame is the world's less `origin`.
+    (0, 0); a tile's frame is the world's less ``origin``.
 
-    Attributes
-    ----------
-    shape : (rows, cols)
-    crop : float, m
-        Left out of each tile at both of its sides in y: a narrower field for training, where
-        Bullet's 600 bytes a sample are what fills memory.
-    heights, support : (161 rows, n cols) float32, m
-        See `Tile`; n is 161 less the crop. `place` overwrites them in place.
-    starts, goals : (rows, cols, 3) and (rows, cols, 2)
-        Each tile's own start (x, y, yaw) and goal (x, y), in the tile's frame.
-    features : dict of (row, col) -> Features
-        Of the tiles placed so far, each in its tile's frame.
+    Attributes:
+        shape: (rows, cols).
+        crop: m, left out of each tile at both of its sides in y: a narrower field for training,
+            where Bullet's 600 bytes a sample are what fills memory.
+        heights, support: (161 rows, n cols) m, see ``Tile``; n is 161 less the crop. ``place``
+            overwrites them in place.
+        starts, goals: (rows, cols, 3) and (rows, cols, 2), each tile's own start (x, y, yaw) and
+            goal (x, y), in the tile's frame.
+        features: (row, col) -> those of the tile there, in its frame; none until one is placed.
+
+    Raises:
+        ValueError: a crop that leaves no room for starts and goals.
     """
 
     def __init__(self, shape: tuple[int, int], crop: float = 0.0) -> None:
@@ -470,12 +470,6 @@ class TileField:
         self.support: HeightArray = np.zeros_like(self.heights)
         self.starts, self.goals = np.zeros((rows, cols, 3)), np.zeros((rows, cols, 2))
         self.features = {tile: Features() for tile in np.ndindex(rows, cols)}
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """World coordinates (x, y) in m of the last sample; the first lies at (0, 0)."""
-        nx, ny = self.heights.shape
-        return (nx - 1) * self.cell, (ny - 1) * self.cell
 
     def place(self, row: int, col: int, tile: Tile) -> None:
         """Copy one tile into the field, in place."""
@@ -505,7 +499,7 @@ class TileField:
         return interpolate(self.heights, self.cell, x, y)
 
     def support_at(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """As `height_at`, for the support surface of the fall rule."""
+        """As ``height_at``, for the support surface of the fall rule."""
         return interpolate(self.support, self.cell, x, y)
 
 
@@ -515,14 +509,14 @@ def interpolate(surface: HeightArray, cell: float, x: ArrayLike, y: ArrayLike) -
     Bullet splits each cell along the diagonal from [ix + 1, iy] to [ix, iy + 1] (its default,
     measured with rays and with contacts). Both ends of the diagonal weigh in everywhere; the third
     corner is [ix, iy] on one side of it and [ix + 1, iy + 1] on the other. Points outside take the
-    nearest border's height.
+    nearest border's height, and the height at a NaN is one.
     """
     nx, ny = surface.shape
     flat = surface.reshape(-1)
     u = np.clip(np.asarray(x) / cell, 0.0, nx - 1)
     v = np.clip(np.asarray(y) / cell, 0.0, ny - 1)
-    ix = np.minimum(u.astype(np.intp), nx - 2)
-    iy = np.minimum(v.astype(np.intp), ny - 2)
+    ix = np.minimum(np.nan_to_num(u).astype(np.intp), nx - 2)  # a robot that blew up has no place
+    iy = np.minimum(np.nan_to_num(v).astype(np.intp), ny - 2)
     u, v = u - ix, v - iy
     corner = ix * ny + iy
     past = u + v - 1.0  # positive past the diagonal
@@ -536,7 +530,7 @@ def interpolate(surface: HeightArray, cell: float, x: ArrayLike, y: ArrayLike) -
 
 
 def _blend(section: Section, band: float) -> FloatArray:
-    """Weights (161,) along x: 0 outside the section, 1 inside, linear over `band` at its ends."""
+    """Weights (161,) along x: 0 outside the section, 1 inside, linear over ``band`` at its ends."""
     return np.clip(np.minimum(_X - section.low, section.high - _X) / band, 0.0, 1.0)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array
+from tdgc.sim.robot import Array, to_world
 
 #: Where the ground is probed: 5 x 3 points (x ahead, y to the left) in m in the heading frame, from
 #: the tail to a step ahead.
@@ -37,10 +37,8 @@ class Ground:
 def measure_ground(loco: Locomotion) -> Ground:
     """The ground under the robots as they are now."""
     world, state = loco.world, loco.world.state
-    c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
     points = np.concatenate([GROUND_PROBES, state.geometry.hips])
-    x = state.position[:, :1] + c * points[:, 0] - s * points[:, 1]
-    y = state.position[:, 1:2] + s * points[:, 0] + c * points[:, 1]
+    x, y = to_world(state.position[:, :2], state.yaw, points)
     n = len(GROUND_PROBES)
     support = world.support_height(
         np.concatenate([x[:, n:], state.foot_position[..., 0]], axis=1),

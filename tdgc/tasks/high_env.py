@@ -574,7 +574,20 @@ class NavigationTask:
 
 
 class NavigationEnv(TaskEnv):
-    """``NavigationTask`` for one robot, id ``tdgc/Navigation-v0``."""
+    """``NavigationTask`` for one robot, id ``tdgc/Navigation-v0``.
+
+    Observations are those of ``high_layout``, (92,) by default; actions are (13,) in [-1, 1]: the
+    continuous commands in the order of ``tdgc.sim.commands.CONTINUOUS``, then the gait. A step is a
+    decision, 0.1 s.
+
+    Args:
+        config: the MDP; the default one if None.
+        low: the frozen low policy's file.
+        render_mode: None or rgb_array.
+
+    Raises:
+        ValueError: a low policy that cannot be used, or a configuration that does not fit it.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  as in gymnasium
 

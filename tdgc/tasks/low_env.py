@@ -373,7 +373,17 @@ def make_task(
 
 
 class LowLevelEnv(TaskEnv):
-    """``LowLevelTask`` for one robot, id ``tdgc/LowLevel-v0``."""
+    """``LowLevelTask`` for one robot, id ``tdgc/LowLevel-v0``.
+
+    Observations are what the actor sees (``tdgc.sim.locomotion.actor_layout``), followed by what
+    only the critic does (``CRITIC_LAYOUT``), (90 + 40,) by default; actions are (12,) in [-4, 4]:
+    offsets of the joint targets from the nominal pose, in units of ``action_scale``. A step is a
+    control step, 0.02 s.
+
+    Args:
+        config: the MDP; the default one, on a plane, if None.
+        render_mode: None or rgb_array.
+    """
 
     def __init__(
         self, config: LowLevelConfig | None = None, render_mode: str | None = None

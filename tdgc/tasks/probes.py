@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array
+from tdgc.sim.robot import Array, to_world
 from tdgc.sim.sensors import Noise
 
 PROBE_RANGE = 0.5  # m, deeper and higher looks the same
@@ -29,9 +29,7 @@ def height_probes(loco: Locomotion, points: Array) -> Array:
     """Ground under the robots' ``points`` (n, 2) m, one of ``PROBES``, against where a standing
     robot's ground would be, (M, n) m."""
     state = loco.world.state
-    c, s = np.cos(state.yaw)[:, None], np.sin(state.yaw)[:, None]
-    x = state.position[:, :1] + c * points[:, 0] - s * points[:, 1]
-    y = state.position[:, 1:2] + s * points[:, 0] + c * points[:, 1]
+    x, y = to_world(state.position[:, :2], state.yaw, points)
     standing = state.position[:, 2:3] - loco.robot.base_height
     return np.clip(loco.world.ground_height(x, y) - standing, -PROBE_RANGE, PROBE_RANGE)
 

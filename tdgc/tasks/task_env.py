@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One robot of a task as a Gymnasium environment.
 
+    It is the MDP of training: dynamics are randomised, the robot is pushed, sensors are noisy, and
+    levels move with success. ``reset`` goes on with the robot's level; ``reset(seed=...)`` makes
+    the task again from that seed, so that all that follows is repeatable. ``info["is_success"]``
+    says whether the goal was reached, or what was to be crossed.
+
     Args:
-        make_task: (seed, whether pictures are wanted) -> the task of one robot. A reset with a seed
-            makes it anew, so that all that follows is repeatable.
+        make_task: (seed, whether pictures are wanted) -> the task of one robot.
         render_mode: None, or rgb_array for pictures of 640 x 400.
     """
 
