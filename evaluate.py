@@ -25,10 +25,10 @@ from tdgc.benchmark import diagnosis, tuning
 from tdgc.benchmark.cues import CuesLaw
 from tdgc.benchmark.diagnosis import Diagnosis, diagnose
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
-from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, Watcher, low_config, plan, run_cell
+from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, plan, run_cell
 from tdgc.benchmark.flags import add_arguments, choose, read
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import describe, write_results
+from tdgc.benchmark.results import FILES, STOPS, describe, salvage, what_stopped, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
@@ -38,7 +38,6 @@ from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.jobs import RunJobs, run_jobs
-from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Policy, load
 from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
@@ -60,7 +59,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     groups = add_arguments(parser, "runs/evaluation")
     groups.episodes.add_argument(
-        "--conditions", default="nominal", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
+        "--conditions", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
     )
     who = groups.policies
     who.add_argument(
@@ -184,16 +183,26 @@ class Evaluation:
         """
         if flags.gui is not None and flags.tracking:
             raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
+        if flags.gui is not None and flags.conditions is not None:
+            raise ValueError("--gui shows the nominal condition: no --conditions")
+        episodes = flags.policies, flags.conditions, flags.families, flags.levels
+        if flags.tracking and any(flag is not None for flag in episodes):
+            raise ValueError(
+                "--tracking is of the low policy alone, on a plane: "
+                "no --policies, --conditions, --families or --levels"
+            )
         shipped = SHIPPED_HIGH if SHIPPED_HIGH.with_suffix(".json").is_file() else None
         high = flags.high or shipped
         automatic = flags.workers == "auto"
         read(flags)
-        asked = flags.policies or ("gp" if high is None else "all")
+        default = "gp" if high is None else "all"
+        asked = default if flags.policies is None else flags.policies
+        conditions = "nominal" if flags.conditions is None else flags.conditions
         tuned = flags.tune is not None or flags.assignments
         evaluation = cls(
             mode=flags.gui or ("tracking" if flags.tracking else "table"),
             policies=choose(asked, ALL_POLICIES, POLICIES, "policy"),
-            conditions=choose(flags.conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition"),
+            conditions=choose(conditions, tuple(CONDITIONS), tuple(CONDITIONS), "condition"),
             families=flags.families,
             levels=flags.levels,
             episodes=flags.episodes,
@@ -228,7 +237,7 @@ class Evaluation:
         drivers: dict[str, Driver] = {}
         for name in self.policies:
             if name == "gp":
-                drivers[name] = BaselineDriver()
+                drivers[name] = BaselineDriver(bounds=config.commands)
             elif name == TEACHER:
                 drivers[name] = TeacherDriver(low, config)
             elif name == CUES:
@@ -244,13 +253,14 @@ class Evaluation:
         return drivers
 
     def make_room(self) -> None:
-        """Make the results folder; what an earlier table left and this one may not write goes
-        away."""
+        """Make the results folder; what an earlier table left goes away, as this one may not write
+        all of it."""
         self.out.mkdir(parents=True, exist_ok=True)
         if self.mode != "table":
             return
         left = ["films/film_*", "films/sheet_*", "films/strip_*", "traces/*.parquet"]
-        left += ["diagnosis.csv", "tuning.json", report.NAME]
+        left += ["diagnosis.csv", "tuning.json", report.NAME, *FILES]
+        left += [name for name, *_ in report.FIGURES]
         for old in [path for pattern in left for path in self.out.glob(pattern)]:
             old.unlink()
         for folder, wanted in (("films", self.filmed > 0), ("traces", self.traced is not None)):
@@ -285,21 +295,35 @@ def run_one(
 ) -> Ran:
     """Run a batch. It writes nothing: it may run on another machine."""
     driver = drivers[cell.policy]
-    recorder, tracer = Recorder(driver, seed, filmed), Tracer(driver, seed)
-    watchers: list[Watcher] = [recorder] if traced is None else [tracer, recorder]
-    episodes = run_cell(cell, low, driver, seed, watchers)
-    traces = [] if traced is None else tracer.traces()
-    hips = float(read_geometry(low_config(low).robot).hips[0, 0])
+    recorder = Recorder(driver, seed, filmed)
+    if traced is None:
+        episodes = run_cell(cell, low, driver, seed, [recorder])
+        return Ran(episodes, recorder.recordings(), [], [])
+    tracer = Tracer(driver, seed)
+    episodes = run_cell(cell, low, driver, seed, [tracer, recorder])
+    traces, hips = tracer.traces(), float(read_geometry(load_low(low)[1].robot).hips[0, 0])
     return Ran(
         episodes,
         recorder.recordings(),
         [diagnose(trace, hips) for trace in traces if trace.outcome != "reached"],
-        [trace for trace in traces if traced is not None and traced.includes(trace)],
+        [trace for trace in traces if traced.includes(trace)],
     )
 
 
-def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> list[str]:
-    """Run all cells and write everything; what is missing, a line each."""
+def run_table(
+    evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver], trained_on: dict[str, int]
+) -> list[str]:
+    """Run all cells and write everything; what is missing, a line each.
+
+    Args:
+        evaluation: what to run.
+        low: the low policy.
+        drivers: of all policies, by name.
+        trained_on: ``editions`` of the policies.
+
+    Raises:
+        Exception: one of ``STOPS``; the table of what is complete is written.
+    """
     e, out = evaluation, evaluation.out
     cells = plan(list(drivers), e.conditions, e.families, e.levels, e.episodes)
     work = functools.partial(
@@ -308,7 +332,11 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     episodes: list[Episode] = []
     recordings: list[Recording] = []
     diagnoses: list[Diagnosis] = []
-    with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
+    total = sum(cell.count for cell in cells)
+    with (
+        salvage(out, episodes, cells, trained_on),
+        tqdm(total=total, unit="episode", dynamic_ncols=True) as bar,
+    ):
         for ran in e.run_jobs(work, cells, e.workers):
             for trace in ran.traces:
                 write(trace, out / "traces")
@@ -316,7 +344,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
             recordings += ran.recordings
             diagnoses += ran.diagnoses
             bar.update(len(ran.episodes))
-    print(describe(write_results(out, episodes, editions(e, low, drivers))))
+    print(describe(write_results(out, episodes, trained_on)))
     plots.success_by_level(out / "summary.json", out / "success.png")
     plots.gait_shares(out, out / "gaits.png")
     plots.headings(out, out / "headings.png")
@@ -398,6 +426,7 @@ def main(arguments: list[str] | None = None) -> int:
         low, config = load_low(evaluation.low)
         read_geometry(config.robot)  # before the results of an earlier call are removed
         drivers = evaluation.drivers(low, config)
+        trained_on = editions(evaluation, low, drivers)  # now: a training may rewrite the file
         evaluation.make_room()
     except (ValueError, OSError) as error:
         fail(error)
@@ -407,14 +436,17 @@ def main(arguments: list[str] | None = None) -> int:
         if evaluation.mode == "tracking":
             run_tracking(evaluation, low)
         elif evaluation.mode == "table":
-            problems = run_table(evaluation, low, drivers)
+            problems = run_table(evaluation, low, drivers, trained_on)
         else:
             run_window(evaluation, low, drivers)
     except (ConfigError, WindowError) as error:  # Bullet cannot load the robot, or has no window
         fail(error)
         return 2
-    except WorkerError as error:
-        problems = [str(error)]
+    except STOPS as error:
+        fail(what_stopped(error))
+        if isinstance(error, KeyboardInterrupt):
+            sys.exit(1)  # and not return: what called this is to stop, too
+        return 1
     for problem in problems:
         fail(problem)
     return 1 if problems else 0

@@ -17,6 +17,7 @@ turn; the table is in ``cluster.json``.
 import argparse
 import functools
 import json
+import math
 import os
 import sys
 import time
@@ -34,11 +35,12 @@ from stable_baselines3.common.logger import Logger
 
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
 from tdgc.errors import InputError
+from tdgc.files import make_folder
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
-from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
+from tdgc.parallel.worker import MakeLink, ProcessLink, WorkerError, memory_mb
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
@@ -333,32 +335,48 @@ def main(arguments: list[str] | None = None) -> int:
         type=workers_flag,
         default="auto",
         metavar="N",
-        help="processes of the measurements with all workers (one per core)",
+        help="number of workers to compare with one (one per core)",
     )
-    parser.add_argument("--seconds", type=float, default=10.0, help="per measurement (10)")
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, help="length of each measurement (10)"
+    )
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--load", action="store_true", help="compare robots, workers and threads")
-    what.add_argument("--update", action="store_true", help="compare the high policy's updates")
-    what.add_argument("--cluster", metavar="ADDRESS", help=f"compare: {CLUSTER_HELP}")
+    what.add_argument(
+        "--load", action="store_true", help="vary the numbers of robots, workers and threads"
+    )
+    what.add_argument(
+        "--update", action="store_true", help="compare the high policy's update with SB3's"
+    )
+    what.add_argument(
+        "--cluster", metavar="ADDRESS", help=f"compare with local processes: {CLUSTER_HELP}"
+    )
     parser.add_argument(
         "--out", type=Path, default=Path("runs/bench"), help="results folder (runs/bench)"
     )
     args = parser.parse_args(arguments)
     try:
+        if not 0.0 < args.seconds < math.inf:
+            raise InputError(f"--seconds must be above 0, not {args.seconds:g}")
         args.workers = choose_workers(args)
-    except InputError as error:
+        make_folder(args.out)
+    except (InputError, OSError) as error:
         print(f"tdgc.bench: {error}", file=sys.stderr)
         return 2
-    if args.load:
-        name, result = "load.json", compare_loads(args.seconds)
-    elif args.update:
-        name, result = "update.json", compare_updates(UPDATES)
-    elif args.cluster is not None:
-        name, result = "cluster.json", compare_places(args.robots, args.workers, args.seconds)
-    else:
-        name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / name).write_text(json.dumps(result, indent=2), encoding="utf-8")
+    try:
+        if args.load:
+            name, result = "load.json", compare_loads(args.seconds)
+        elif args.update:
+            name, result = "update.json", compare_updates(UPDATES)
+        elif args.cluster is not None:
+            name, result = "cluster.json", compare_places(args.robots, args.workers, args.seconds)
+        else:
+            name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
+        (args.out / name).write_text(json.dumps(result, indent=2), encoding="utf-8")
+    except (WorkerError, OSError) as error:
+        lines = str(error).splitlines()  # a worker's traceback is between the first and the last
+        said = " ".join(dict.fromkeys((lines[0], lines[-1])))
+        print(f"tdgc.bench: {said}", file=sys.stderr)
+        return 1
     return 0
 
 

@@ -25,7 +25,8 @@ from torch import nn
 
 from tdgc import policies
 from tdgc.benchmark.tracking import draw_commands, walk_on_plane
-from tdgc.config import CalibrationConfig, CommandRanges, LowLevelConfig
+from tdgc.config import CalibrationConfig, CommandRanges, LowLevelConfig, LowTrainConfig
+from tdgc.files import make_folder
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.jobs import run_jobs
 from tdgc.parallel.worker import WorkerError
@@ -54,7 +55,7 @@ _PULL = 0.1
 # was its fancy, and there was nothing to tell so.
 _NETWORKS, _HIDDEN, _EPOCHS, _MINIBATCH = 3, (128, 64), 300, 256
 _CORRECTIONS = 3000  # minibatches that the corrector learns from
-_ROBOTS, _PLANE_SHARE = 120, 0.6  # in distillation, as in training
+_ROBOTS = 120  # in distillation, as in training
 _TURN = 60  # control steps between updates
 _KEPT = 40  # turns whose states are learned from
 _UPDATES, _STATES = 120, 1024  # minibatches a turn, and their size
@@ -205,7 +206,7 @@ class Corrector:
 def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> list[LowLevelTask]:
     """The training MDP as it is late in a run: all commands, all levels, most robots on a plane."""
     config = dataclasses.replace(config, command_start=1.0)
-    on_plane = round(_PLANE_SHARE * robots)
+    on_plane = round(LowTrainConfig().plane_share * robots)
     seeds = np.random.SeedSequence(seed).generate_state(2).tolist()
     plane = LowLevelTask(dataclasses.replace(config, terrain="plane"), on_plane, seeds[0])
     tiles = dataclasses.replace(config, terrain="tiles")
@@ -354,27 +355,30 @@ def main(arguments: list[str] | None = None) -> int:
         "--low", type=Path, required=True, help="low policy, with or without suffix"
     )
     parser.add_argument("--out", type=Path, required=True, help="where to write the copy")
+    parser.add_argument("--robots", type=int, default=4800, help="number of robots measured (4800)")
     parser.add_argument(
-        "--robots", type=int, default=4800, help="number that walk and are measured (4800)"
-    )
-    parser.add_argument(
-        "--turns", type=int, default=60, help="of 60 control steps that the copy learns for (60)"
+        "--turns", type=int, default=60, help="distillation rounds of 60 control steps each (60)"
     )
     parser.add_argument(
         "--workers", type=workers_flag, default="auto", metavar="N",
         help="simulation processes (one per core)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=42, help="of all randomness (42)")
+    parser.add_argument("--seed", type=int, default=42, help="random seed (42)")
     args = parser.parse_args(arguments)
     try:
         for name, least in (("robots", 64), ("turns", 1), ("seed", 0)):
             if getattr(args, name) < least:
                 raise ValueError(f"--{name} must be {least} or more, not {getattr(args, name)}")
         low = load_low(args.low)[0]
-        workers = args.workers
-        if workers == "auto":
-            workers = auto_workers(_ROBOTS, usable_cores())
-        calibration = CalibrationConfig(args.robots, args.turns)
+        make_folder(args.out.parent)
+    except (ValueError, OSError) as error:
+        print(f"tdgc.calibration: {error}", file=sys.stderr)
+        return 2
+    workers = args.workers
+    if workers == "auto":
+        workers = auto_workers(_ROBOTS, usable_cores())
+    calibration = CalibrationConfig(args.robots, args.turns)
+    try:
         student, facts = calibrate(low, calibration, workers, args.seed)
         policies.save_copy(args.out, low, student.tensors(), {**low.meta, "calibration": facts})
     except ValueError as error:

@@ -21,12 +21,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.diagnose", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("log", type=Path, help=".npz or .csv, see docs/mujoco.md")
-    parser.add_argument("--export", type=Path, required=True, help="folder that was on the robot")
+    parser.add_argument("log", type=Path, help="the log, .npz or .csv (docs/deploy.md)")
+    parser.add_argument("--export", type=Path, required=True, help="exported folder on the robot")
     parser.add_argument(
-        "--outcome", choices=log.ENDS, help="how the episode ended, where the log does not say"
+        "--outcome", choices=log.ENDS, help="how the episode ended; only fell and collided need it"
     )
-    parser.add_argument("--out", type=Path, default=Path("runs/diagnosis"), help="results folder")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/diagnosis"), help="results folder (runs/diagnosis)"
+    )
     args = parser.parse_args(arguments)
     try:
         require("a log's diagnosis", ("jsonschema", "onnxruntime"), "mujoco")
@@ -38,13 +40,15 @@ def main(arguments: list[str] | None = None) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         path = trace.write(episode, args.out)
         largest, first = log.replay(found, controller)
+        failure = None
+        if episode.outcome != "reached":
+            failure = diagnosis.diagnose(episode, float(geometry.hips[0, 0]))
+            diagnosis.write([failure], args.out / "diagnosis.csv")
     except (ValueError, OSError) as error:
         print(f"tdgc.diagnose: {error}", file=sys.stderr)
         return 2
     print(f"{found.name}: {episode.outcome} after {episode['time'][-1]:.2f} s; trace in {path}")
-    if episode.outcome != "reached":
-        failure = diagnosis.diagnose(episode, float(geometry.hips[0, 0]))
-        diagnosis.write([failure], args.out / "diagnosis.csv")
+    if failure is not None:
         print(f"{failure.layer}: {failure.cause}\n{failure.evidence}")
     if first < float("inf"):
         print(

@@ -8,7 +8,6 @@ A graph holds all that stands between a robot's sensors and its joint targets: o
 unit, and how the joints are driven; likewise for ``high``, with the task. The robot's URDF is there
 too. Afterwards each pair of graphs drives a robot in the simulator for as long as an episode, from
 the folder alone (``tdgc.deploy``), and its outputs are compared with the policies'.
-
 """
 
 import argparse
@@ -87,7 +86,8 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
 
 
 def interfaces(pair: Pair, low: LowGraph, high: HighGraph) -> dict[str, Table]:
-    """What the two interface files say, by graph; ``tdgc.deploy`` has their schema."""
+    """What the two interface files say, by graph, but for the graphs' files; ``tdgc.deploy`` has
+    their schema."""
     config, task = pair.low_config, pair.high_config
     robot, physics = config.robot, config.physics
     geometry, urdf = read_geometry(robot), urdf_path(robot)
@@ -106,7 +106,7 @@ def interfaces(pair: Pair, low: LowGraph, high: HighGraph) -> dict[str, Table]:
             "gravity_when_level": _quantity("1", [0.0, 0.0, -1.0]),
         },
         "robot": {
-            "urdf": {"file": urdf.name, "sha256": checksum(urdf)},
+            "urdf": _file(urdf),
             "link_masses": _quantity("kg", geometry.masses),
             "total_mass": _quantity("kg", sum(geometry.masses.values())),
             "standing_height": _quantity("m", robot.base_height),
@@ -201,6 +201,8 @@ def _commands(ranges: CommandRanges) -> list[Table]:
 def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
     """Write graphs and interface files of both policies and the URDF into ``folder``, which exists.
 
+    Graphs of other formats, which an earlier export left there, go away.
+
     Raises:
         OSError: a file cannot be written.
     """
@@ -208,11 +210,21 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
     high = HighGraph(pair.high, pair.high_config, pair.low_config)
     tables = interfaces(pair, low, high)
     for name, graph in (("low", low), ("high", high)):
-        text = json.dumps(tables[name], indent=2) + "\n"
+        files = {}
+        for form, suffix in FORMATS.items():
+            path = folder / (name + suffix)
+            path.unlink(missing_ok=True)
+            if form in formats:
+                _write_graph(graph, path)
+                files[form] = _file(path)
+        text = json.dumps(tables[name] | {"files": files}, indent=2) + "\n"
         interface_path(folder, name).write_text(text, encoding="utf-8")
-        for form in formats:
-            _write_graph(graph, folder / (name + FORMATS[form]))
     _copy_robot(urdf_path(pair.low_config.robot), folder)
+
+
+def _file(path: Path) -> Table:
+    """How an interface file names a file beside it."""
+    return {"file": path.name, "sha256": checksum(path)}
 
 
 def _copy_robot(urdf: Path, folder: Path) -> None:
@@ -340,6 +352,23 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     return Check(float(largest), np.array(seconds), np.array(repeated))
 
 
+def _report(form: str, result: Check) -> bool:
+    """Say what was found; whether graphs and policies differ by no more than is allowed."""
+    (median, slow), (again, slow_again) = (
+        1e3 * np.percentile(times, [50.0, 99.0]) for times in (result.seconds, result.repeated)
+    )
+    print(
+        f"{form}: largest difference {result.difference:.1e} in {len(result.seconds)} control "
+        f"steps; a step takes {median:.3f} ms (median; 99 % at most {slow:.3f} ms) between the "
+        f"simulator's, {again:.3f} ms ({slow_again:.3f} ms) right after the one before"
+    )
+    good = result.difference <= TOLERANCE
+    if not good:
+        message = f"{form} differs by {result.difference:.1e}, allowed is {TOLERANCE:g}"
+        print(f"tdgc.export: {message}", file=sys.stderr)
+    return good
+
+
 def _choose_formats(text: str) -> list[str]:
     names = list(dict.fromkeys(text.split(",")))
     for name in names:
@@ -359,33 +388,21 @@ def main(arguments: list[str] | None = None) -> int:
         "--high", type=Path, default=PRETRAINED / "high", help="high policy (shipped)"
     )
     parser.add_argument("--out", type=Path, required=True, help="folder to write into")
-    parser.add_argument("--format", default=",".join(FORMATS), help=f"of {', '.join(FORMATS)}")
+    parser.add_argument(
+        "--format", default=",".join(FORMATS), help=f"comma-separated ({','.join(FORMATS)})"
+    )
     args = parser.parse_args(arguments)
     try:
         formats = _choose_formats(args.format)
         pair = load_pair(args.low, args.high)
         args.out.mkdir(parents=True, exist_ok=True)
         write(pair, args.out, formats)
+        th.set_num_threads(1)  # the time of one core is asked for
+        good = [_report(form, check(args.out, form, args.low, args.high)) for form in formats]
     except (ValueError, OSError) as error:
         print(f"tdgc.export: {error}", file=sys.stderr)
         return 2
-    th.set_num_threads(1)  # the time of one core is asked for
-    good = True
-    for form in formats:
-        result = check(args.out, form, args.low, args.high)
-        (median, slow), (again, slow_again) = (
-            1e3 * np.percentile(times, [50.0, 99.0]) for times in (result.seconds, result.repeated)
-        )
-        print(
-            f"{form}: largest difference {result.difference:.1e} in {len(result.seconds)} control "
-            f"steps; a step takes {median:.3f} ms (median; 99 % at most {slow:.3f} ms) between the "
-            f"simulator's, {again:.3f} ms ({slow_again:.3f} ms) right after the one before"
-        )
-        if not result.difference <= TOLERANCE:
-            message = f"{form} differs by {result.difference:.1e}, allowed is {TOLERANCE:g}"
-            print(f"tdgc.export: {message}", file=sys.stderr)
-            good = False
-    return 0 if good else 1
+    return 0 if all(good) else 1
 
 
 if __name__ == "__main__":

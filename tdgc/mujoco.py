@@ -23,7 +23,7 @@ from tdgc.benchmark import flags
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Batch, Cell, Episode, EpisodeLog, Watcher, closed_loop, plan
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import describe, write_results
+from tdgc.benchmark.results import FILES, STOPS, describe, salvage, what_stopped, write_results
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
@@ -160,14 +160,25 @@ def run_cell(
     return episodes, recordings
 
 
+def make_room(args: argparse.Namespace) -> None:
+    """Make the results folder; what an earlier table left goes away."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    for pattern in ("logs/*.npz", "films/*", "settings.json", *FILES):
+        for old in args.out.glob(pattern):
+            old.unlink()
+    for folder, wanted in (("logs", args.log), ("films", args.video)):
+        if wanted:
+            (args.out / folder).mkdir(exist_ok=True)
+
+
 def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
-    """Run all cells and write everything; what is missing, a line each."""
-    for old in (*args.out.glob("logs/*.npz"), *args.out.glob("films/*")):
-        old.unlink()
-    if args.log:
-        (args.out / "logs").mkdir(exist_ok=True)
-    if args.video:
-        (args.out / "films").mkdir(exist_ok=True)
+    """Run all cells and write everything; what is missing, a line each.
+
+    Raises:
+        Exception: one of ``STOPS``; the table of what is complete is written.
+    """
+    settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
+    (args.out / "settings.json").write_text(json.dumps(settings, indent=2), encoding="utf-8")
     cells = plan([POLICY], ["nominal"], args.families, args.levels, args.episodes)
     work = functools.partial(
         run_cell,
@@ -180,14 +191,16 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     )
     episodes: list[Episode] = []
     recordings: list[Recording] = []
-    with tqdm(total=sum(c.count for c in cells), unit="episode", dynamic_ncols=True) as bar:
+    total = sum(cell.count for cell in cells)
+    with (
+        salvage(args.out, episodes, cells),
+        tqdm(total=total, unit="episode", dynamic_ncols=True) as bar,
+    ):
         for ran, recorded in run_jobs(work, cells, args.workers):
             episodes += ran
             recordings += recorded
             bar.update(len(ran))
     print(describe(write_results(args.out, episodes)))
-    settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
-    (args.out / "settings.json").write_text(json.dumps(settings, indent=2), encoding="utf-8")
     print(f"\ntables are in {args.out}")
     return film.produce(recordings, args.out / "films", args.workers) if recordings else []
 
@@ -270,19 +283,30 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
 
 
 def main(arguments: list[str] | None = None) -> int:
+    def fail(error: object) -> None:
+        print(f"tdgc.mujoco: {error}", file=sys.stderr)
+
     args = parse(arguments)
     try:
         config = check(args)
+        if not args.gui:
+            make_room(args)
+    except (ValueError, OSError) as error:
+        fail(error)
+        return 2
+    problems: list[str] = []
+    try:
         if args.gui:
             show(args, config)
-            return 0
-        args.out.mkdir(parents=True, exist_ok=True)
-        problems = run_table(args, config)
-    except (ValueError, OSError, WindowError) as error:
-        print(f"tdgc.mujoco: {error}", file=sys.stderr)
+        else:
+            problems = run_table(args, config)
+    except (ValueError, WindowError) as error:  # MuJoCo cannot load the robot, or has no window
+        fail(error)
         return 2
+    except STOPS as error:
+        problems = [what_stopped(error)]
     for problem in problems:
-        print(f"tdgc.mujoco: {problem}", file=sys.stderr)
+        fail(problem)
     return 1 if problems else 0
 
 

@@ -1,20 +1,22 @@
-"""The ablation: variants that train, cells that go on where they were, a table that is right."""
+"""The ablation: variants that train, trials that go on where they were, a table that is right."""
 
-import csv
+import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import evaluate
 import train_high
 from tdgc import policies
 from tdgc.ablate.__main__ import choose, main, plan
-from tdgc.ablate.cells import Cell, Runner
-from tdgc.ablate.table import describe, rows
+from tdgc.ablate.table import Found, describe, difference, rates, rows
+from tdgc.ablate.trials import Result, Runner, Trial
 from tdgc.ablate.variants import HELPS, VARIANTS, WHOLE, Variant, variants
+from tdgc.benchmark import results
 from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, LowLevelConfig, with_overrides
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.learn.run import Interruption
@@ -78,42 +80,31 @@ def test_the_feed_forward_variant_has_as_many_parameters() -> None:
 # ------------------------------------------------------------------ the table
 
 
-def evaluated(folder: Path, good: Sequence[bool]) -> None:
-    """As evaluate.py leaves a cell: two families, the same number of tiles each."""
-    (folder / "evaluation").mkdir(parents=True)
-    half = len(good) // 2
-    with open(folder / "evaluation" / "episodes.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, ["family", "level", "episode", "outcome"])
-        writer.writeheader()
-        for k, yes in enumerate(good):
-            family, outcome = ("rough", "gap")[k // half], "reached" if yes else "fell"
-            writer.writerow({"family": family, "level": 6, "episode": k % half, "outcome": outcome})
+TILES = list(itertools.product(("rough", "gap"), (6,), range(4)))
 
 
-def test_rows_are_over_seeds_and_pairs_on_the_same_tiles(tmp_path: Path) -> None:
+def result(good: str, **facts: float) -> Result:
+    """Tile by tile, 1 where the goal was reached."""
+    return Result(facts, np.array([mark == "1" for mark in good]))
+
+
+def test_rows_are_over_tiles_and_seeds_and_pairs_have_the_same_seed() -> None:
     full, trot, gp = named(WHOLE), named("trot"), named("gp")
-    cells = plan([full, trot, named("semantic"), gp], [1, 2])
-    assert [cell.name for cell in cells] == [
+    trials = plan([full, trot, named("semantic"), gp], [1, 2])
+    assert [trial.name for trial in trials] == [
         "full-1", "trot-1", "semantic-1", "gp", "full-2", "trot-2", "semantic-2"
     ]  # fmt: skip
-    for name, good in (
-        ("full-1", [True] * 6 + [False] * 2),
-        ("full-2", [True] * 8),
-        ("trot-1", [True] * 4 + [False] * 4),
-        ("gp", [False] * 4 + [True] * 4),
-    ):
-        evaluated(tmp_path / name, good)
     facts = {"steps": 1000, "train_seconds": 1800, "simulated_hours": 0.5}
-    found: dict[Cell, Any] = {
-        Cell(full, 1): facts,
-        Cell(full, 2): {**facts, "train_seconds": 5400},
-        Cell(trot, 1): facts,
-        Cell(trot, 2): "3 faults of workers",
-        Cell(gp, None): {},
+    found: dict[Trial, Found] = {
+        Trial(full, 1): result("11111100", **facts),
+        Trial(full, 2): result("11111111", **facts | {"train_seconds": 5400}),
+        Trial(trot, 1): result("11110000", **facts),
+        Trial(trot, 2): "3 faults of workers",
+        Trial(gp, None): result("00001111"),
     }
-    table = rows(tmp_path, cells, found)
+    table = rows(TILES, trials, found)
     whole, one, later, script = table
-    assert (whole["n"], whole["reached"], whole["versus"]) == (16, 14, None)
+    assert (whole["n"], whole["reached"], whole["versus"]) == (8, 7.0, None)
     assert whole["families"] == {"rough": 1.0, "gap": 0.75}
     assert whole["seeds"] == {"1": 0.75, "2": 1.0}
     assert (whole["steps"], whole["train_seconds"]) == (1000, 3600)
@@ -121,18 +112,72 @@ def test_rows_are_over_seeds_and_pairs_on_the_same_tiles(tmp_path: Path) -> None
     assert (one["versus"]["n"], one["versus"]["lost"], one["versus"]["gained"]) == (8, 2, 0)
     assert one["versus"]["difference"] == -0.25
     assert "n" not in later and later["errors"] == {}
-    # The script runs once, and is compared with both trainings.
-    assert (script["n"], script["versus"]["n"]) == (8, 16) and "steps" not in script
-    assert (script["versus"]["lost"], script["versus"]["gained"]) == (8, 2)
+    # The script runs once, and is compared with both trainings on the same eight tiles.
+    assert (script["n"], script["versus"]["n"]) == (8, 8) and "steps" not in script
+    assert (script["versus"]["lost"], script["versus"]["gained"]) == (4, 1)
     text = describe(table)
     lines = [line.split() for line in text.splitlines()]
-    assert lines[0][:2] == ["variant", "n"] and lines[0][-4:] == ["rough", "gap", "steps", "hours"]
-    assert lines[1] == [
-        "full", "16", "87.5%", "[64.0,", "96.5]", "100.0%", "75.0%", "0.00M", "1.00"
-    ]  # fmt: skip
+    assert lines[0][:2] == ["variant", "tiles"]
+    assert lines[0][-4:] == ["rough", "gap", "steps", "hours"]
+    assert lines[1][:3] == ["full", "8", "87.5%"]
+    assert lines[1][-4:] == ["100.0%", "75.0%", "0.00M", "1.00"]
     assert lines[2][:6] == ["trot", "8", "50.0%", "[21.5,", "78.5]", "-25.0"]
     assert lines[3] == ["semantic", "to", "come"]
     assert text.splitlines()[-1] == "trot, seed 2: 3 faults of workers"
+
+
+def drawn(seeds: int, spread: float, n: int = 200) -> np.ndarray:
+    """Outcomes (seeds, n) on tiles that are more or less alike: each is good with a probability of
+    its own, 0.7 on average."""
+    rng = np.random.default_rng(0)
+    chance = rng.beta(0.7 / spread, 0.3 / spread, n)
+    return np.asarray(rng.random((seeds, n)) < chance)
+
+
+def width(found: dict[str, float]) -> float:
+    return found["ci_high"] - found["ci_low"]
+
+
+def test_intervals_of_one_seed_are_those_of_every_other_table() -> None:
+    one, other = drawn(2, spread=1.0)
+    mine, wanted = rates(one[None]), results.rates(one.tolist())
+    assert mine == pytest.approx(wanted, rel=1e-12)
+    pairs = zip(one.tolist(), other.tolist(), strict=True)
+    assert difference(one[None], other[None]) == pytest.approx(results.difference(pairs), rel=1e-12)
+
+
+def test_a_tile_counts_once_however_many_seeds_are_on_it() -> None:
+    """A script on 100 tiles, against two trainings that do the same."""
+    script, whole = drawn(2, spread=1.0, n=100)
+    once = difference(script[None], whole[None])
+    twice = difference(np.tile(script, (2, 1)), np.tile(whole, (2, 1)))
+    assert {key: twice[key] for key in ("n", "gained", "lost", "difference")} == {
+        key: once[key] for key in ("n", "gained", "lost", "difference")
+    }
+    assert width(twice) == pytest.approx(width(once), rel=0.02)
+    good = rates(np.tile(whole, (3, 1)))
+    assert (good["n"], good["reached"]) == (100, whole.sum())
+    assert width(good) == pytest.approx(width(rates(whole[None])), rel=0.02)
+
+
+@pytest.mark.parametrize("spread", [0.05, 1.0, 4.0])
+def test_intervals_are_as_wide_as_tiles_drawn_anew_make_them(spread: float) -> None:
+    """A bootstrap over the tiles: from those that decide nothing to those that decide it all."""
+    good, rng = drawn(3, spread), np.random.default_rng(1)
+    script = np.tile(drawn(1, spread), (3, 1))
+    for found, values in (
+        (rates(good), good.astype(float)),
+        (difference(script, good), script.astype(float) - good),
+    ):
+        again = rng.choice(values.mean(axis=0), (4000, 200)).mean(axis=1)
+        low, high = np.quantile(again, [0.025, 0.975])
+        assert width(found) == pytest.approx(high - low, rel=0.08)
+
+
+def test_an_interval_without_failures_has_a_width() -> None:
+    perfect = np.ones((2, 50), dtype=bool)
+    assert rates(perfect)["ci_low"] < 0.97
+    assert width(difference(perfect, perfect)) > 0.0
 
 
 # ------------------------------------------------------------------ the whole command
@@ -152,7 +197,7 @@ def in_this_process(work: Callable[[Any], Any], jobs: Sequence[Any], _: int) -> 
 def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Stopped in the middle of its first training, then finished with a cell that cannot be. What
+    """Stopped in the middle of its first training, then finished with a trial that cannot be. What
     it trains is what train_high.py trains."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
@@ -204,7 +249,7 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     )
 
 
-def test_a_cell_that_cannot_be_trained_is_named_and_the_others_are_kept(
+def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Two minibatches of two robots' rollouts leave none for one; ``gp`` needs no training."""
@@ -222,7 +267,61 @@ def test_a_cell_that_cannot_be_trained_is_named_and_the_others_are_kept(
     assert capsys.readouterr().err.count("tdgc.ablate: ") == 2
 
 
-def test_time_that_is_over_stops_before_a_cell(
+EPISODES = "evaluation/episodes.csv"
+
+
+def finish(folder: Path) -> None:
+    """Leave a trial as it is when it is done on ``TINY``'s only tile."""
+    (folder / "evaluation").mkdir(parents=True)
+    facts = {"evaluate_seconds": 1.0, "steps": 48, "train_seconds": 2, "simulated_hours": 0.0}
+    (folder / "cell.json").write_text(json.dumps(facts))
+    (folder / EPISODES).write_text("family,level,episode,outcome\ntilt,6,0,reached\n")
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("cell.json", "{", "{0}: not a JSON file"),
+        ("cell.json", "{}", "{0}: 'steps' must be a number, not None"),
+        (EPISODES, None, "[Errno 2] No such file or directory: '{0}'"),
+        (EPISODES, "family\ntilt\n", "{0}: damaged, or not of an evaluation"),
+        (EPISODES, "family,level,episode\n", "{0}: no outcome of episode 0 on tilt, level 6"),
+        (
+            EPISODES,
+            "family,level,episode,outcome\ntilt,6,0,rea",
+            "{0}: no outcome of episode 0 on ",
+        ),
+        ("config.json", "[]", "{0}: 'steps' must be a number, not None"),
+        ("policy.json", "{", "{0}: not JSON ("),
+    ],
+)
+def test_a_damaged_trial_is_named_and_the_others_are_kept(
+    file: str, text: str | None, message: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Both of them are done, but for the last two files: those count while a training ends."""
+    for name in ("full-42", "trot-42"):
+        finish(tmp_path / name)
+    path = tmp_path / "trot-42" / file
+    if file in ("config.json", "policy.json"):
+        monkeypatch.setattr(train_high, "main", lambda flags: 0)
+        (path.parent / "cell.json").unlink()
+        (path.parent / "checkpoints" / "step-48").mkdir(parents=True)
+        (path.parent / "config.json").write_text('{"steps": 48}')
+    if text is None:
+        path.unlink()
+    else:
+        path.write_text(text)
+    assert main([*TINY, "--only", "full,trot", "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"tdgc.ablate: trot-42: {message.format(path)}")
+    assert said.count("\n") == 1
+    full, trot = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert (full["n"], full["rate"], full["errors"]) == (1, 1.0, {})
+    assert "n" not in trot and trot["errors"]["42"].startswith(message.format(path))
+
+
+def test_time_that_is_over_stops_before_a_trial(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*TINY, "--only", "full", "--time-limit", "0", "--out", str(tmp_path)]) == 0

@@ -105,6 +105,49 @@ def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result == {"stock": 6.0, "fast": 2.0, "ratio": 3.0}  # turns of 2, 3 and 6 times
 
 
-def test_more_workers_than_robots(capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench.main(["--robots", "2", "--workers", "3"]) == 2
-    assert capsys.readouterr().err == ("tdgc.bench: --workers must be 1 to the number of robots\n")
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--robots 2 --workers 3", "--workers must be 1 to the number of robots\n"),
+        ("--robots 0", "--workers must be 1 to the number of robots\n"),
+        ("--seconds 0", "--seconds must be above 0, not 0\n"),
+        ("--seconds=-1", "--seconds must be above 0, not -1\n"),
+        ("--seconds nan", "--seconds must be above 0, not nan\n"),
+        ("--out {0}/file/out", "[Errno 20] Not a directory: '{0}/file/out'\n"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line_before_anything_is_measured(
+    flags: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    out = ["--out", str(tmp_path / "out")]
+    assert bench.main([*out, *flags.format(tmp_path).split()]) == 2
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", f"tdgc.bench: {message.format(tmp_path)}")
+    assert not (tmp_path / "out").exists()
+
+
+def no_task(config: LowLevelConfig, robots: int, seed: int) -> LowLevelTask:
+    raise RuntimeError(f"no robots today, not even {robots}")
+
+
+def test_a_worker_that_fails_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bench, "LowLevelTask", no_task)
+    flags = ["--robots", "2", "--workers", "1", "--seconds", "0.1", "--out", str(tmp_path)]
+    assert bench.main(flags) == 1
+    wanted = "tdgc.bench: worker 0 failed: RuntimeError: no robots today, not even 2\n"
+    assert capsys.readouterr().err == wanted
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_result_that_cannot_be_written_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("ROBOTS", "WORKERS", "THREADS"):
+        monkeypatch.setattr(bench, f"LOAD_{name}", (1,))
+    (tmp_path / "load.json").mkdir()
+    assert bench.main(["--load", "--seconds", "0.01", "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert said == f"tdgc.bench: [Errno 21] Is a directory: '{tmp_path / 'load.json'}'\n"

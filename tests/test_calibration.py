@@ -240,6 +240,21 @@ def test_bad_input_is_one_line(
     assert said.err.count("\n") == 1 and not out.exists()
 
 
+def test_where_nothing_can_be_written_nothing_is_calibrated(
+    low: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def calibrate(*args: object) -> None:
+        raise AssertionError("it has begun")
+
+    monkeypatch.setattr(calibration, "calibrate", calibrate)
+    policies.save_copy(tmp_path / "low", low, {}, low.meta)
+    out = tmp_path / "low.json" / "copy"  # within a file
+    assert calibration.main(["--low", str(tmp_path / "low"), "--out", str(out)]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("tdgc.calibration: ")
+    assert "low.json'" in said.err and said.err.count("\n") == 1
+
+
 def test_a_copy_has_the_tensors_of_its_policy(low: Policy, tmp_path: Path) -> None:
     for name, tensor in (("actor.9.bias", th.zeros(3)), ("actor.0.bias", th.zeros(3))):
         with pytest.raises(ValueError, match=rf"^no tensor {name} of shape \(3,\) in this policy$"):

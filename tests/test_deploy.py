@@ -1,6 +1,8 @@
 """An exported folder says all that a program needs, and the controller does what it says."""
 
 import copy
+import csv
+import functools
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +12,11 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from tdgc import export
+from tdgc import diagnose, export
+from tdgc.deploy import log
 from tdgc.deploy.controller import GRAPHS, Controller
-from tdgc.deploy.interface import SCHEMA, ExportError, read_interface
+from tdgc.deploy.interface import SCHEMA, ExportError, checksum, read_interface
+from tdgc.deploy.log import LogError, LogWriter
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import RobotState
 from tdgc.tasks.high_env import PRETRAINED
@@ -75,8 +79,9 @@ def test_the_schema_is_one_and_the_files_keep_to_it(folder: Path) -> None:
 @pytest.mark.parametrize("name", GRAPHS)
 def test_each_missing_field_is_refused_in_one_line(folder: Path, tmp_path: Path, name: str) -> None:
     whole = json.loads((folder / f"{name}_interface.json").read_text())
-    masses = ("robot", "link_masses", "value")  # whose names are the robot's
-    fields = [path for path in places(whole) if path[:-1] != masses]
+    # Names of links are the robot's, and which formats there are was chosen.
+    free = (("robot", "link_masses", "value"), ("files",))
+    fields = [path for path in places(whole) if path[:-1] not in free]
     assert len(fields) > 150
     schema = Draft202012Validator(json.loads(SCHEMA.read_text()))
     for *above, last in fields:
@@ -97,12 +102,13 @@ def test_each_missing_field_is_refused_in_one_line(folder: Path, tmp_path: Path,
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 1}, "an interface of version 1, this package reads 2; export the policies"),
+        ({"version": 2}, "an interface of version 2, this package reads 3; export the policies"),
         ({"version": None}, "an interface of version None"),
         ({"rate": {"unit": "ms", "value": 50}}, "rate.unit: 'Hz' was expected"),
         ({"rate": {"unit": "Hz", "value": 0}}, "rate.value: 0 is less than or equal to"),
         ({"joints": ["a"]}, "joints: "),
         ({"colour": "red"}, "'colour' was unexpected"),
+        ({"files": {}}, "files: {} "),
     ],
 )
 def test_other_interfaces_are_refused(
@@ -199,9 +205,148 @@ def test_it_stands_after_the_goal_and_after_the_horizon(controller: Controller) 
     assert np.array_equal(controller.commands, stand) and not controller.decided
 
 
-def test_a_graph_that_is_missing_is_refused(folder: Path, tmp_path: Path) -> None:
-    for path in folder.glob("*_interface.json"):
+def test_a_graph_that_is_not_the_exports_is_refused(folder: Path, tmp_path: Path) -> None:
+    for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    for form, suffix in (("torchscript", "pt"), ("onnx", "onnx")):
-        with pytest.raises(ExportError, match=rf"low\.{suffix}: missing, or no"):
-            Controller(tmp_path, form)
+    with pytest.raises(ExportError, match=r"its low policy was exported as torchscript, not onnx$"):
+        Controller(tmp_path, "onnx")
+    graph = tmp_path / "high.pt"
+    graph.write_bytes((folder / "low.pt").read_bytes())
+    with pytest.raises(ExportError, match=r"high.pt: not the graph that high_interface.json was"):
+        Controller(tmp_path, FORM)
+    graph.unlink()
+    with pytest.raises(ExportError, match=r"high.pt: No such file or directory$"):
+        Controller(tmp_path, FORM)
+    graph.write_bytes(b"no graph")
+    path = tmp_path / "high_interface.json"
+    table = json.loads(path.read_text())
+    table["files"][FORM]["sha256"] = checksum(graph)
+    path.write_text(json.dumps(table))
+    with pytest.raises(ExportError, match=r"high.pt: no TorchScript graph$"):
+        Controller(tmp_path, FORM)
+
+
+# --- logs ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def walk(controller: Controller, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of eleven steps of a robot that stays where it is, on ground that rises."""
+    robot, writer = state(controller), LogWriter(controller)
+    controller.reset()
+    readings = controller.sense(robot, np.array([5.0, 1.0]), "stair", lambda x, y: 0.1 * x)
+    for _ in range(11):
+        controller.step(readings)
+        writer.add(readings)
+    writer.end(readings)
+    path = tmp_path_factory.mktemp("log") / "walk.npz"
+    writer.save(path)
+    return path
+
+
+def columns(log: Path) -> dict[str, list[str]]:
+    """The columns of a log as a CSV file has them, in order."""
+    table = dict(np.load(log))
+    entries = {"time": table.pop("time")}
+    entries |= {f"{n}_{k}": x[:, k] for n, x in table.items() for k in range(x.shape[1])}
+    return {n: ["" if np.isnan(v) else repr(float(v)) for v in x] for n, x in entries.items()}
+
+
+def write_csv(path: Path, head: list[str], entries: list[list[str]]) -> Path:
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([head, *zip(*entries, strict=True)])
+    return path
+
+
+def test_columns_go_by_their_numbers(controller: Controller, walk: Path, tmp_path: Path) -> None:
+    """As a table that sorts its names has them: probes_0, probes_1, probes_10, probes_11."""
+    entries = columns(walk)
+    names = sorted(entries)
+    assert names.index("probes_10") < names.index("probes_2")
+    wanted = log.read(walk, controller)
+    entries["motor_3"] = ["1"] * 12  # what else is logged does not matter
+    for order in ([*names, "motor_3"], names[::-1]):
+        path = write_csv(tmp_path / "walk.csv", order, [entries[name] for name in order])
+        found = log.read(path, controller)
+        for name, values in wanted.values.items():
+            assert np.array_equal(found.values[name], values, equal_nan=True), name
+    assert len(np.unique(wanted.values["probes"][0])) > 20  # so that an order shows
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("probes_7", "probes_32", "no column 'probes_7', but 'probes_32'"),
+        ("family_0", "family_6", "no column 'family_0', but 'family_6'"),
+        ("gravity_1", "gravity_2", "the column 'gravity_2' stands twice"),
+        ("gravity_1", "gravity_02", "the column 'gravity_2' stands twice"),
+        ("gravity_2", "gravitas", "'gravity' must be numbers (12, 3), not (12, 2)"),
+    ],
+)
+def test_columns_with_gaps_or_twice_are_refused(
+    controller: Controller, walk: Path, tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    entries = columns(walk)
+    head = [new if name == old else name for name in entries]
+    path = write_csv(tmp_path / "bad.csv", head, list(entries.values()))
+    with pytest.raises(LogError) as refused:
+        log.read(path, controller)
+    assert str(refused.value) == f"{path}: {message}"
+
+
+def damaged(walk: Path, out: Path, kind: str) -> Path:
+    """A copy of a log that a full disk, a bad cable or a wrong tool has spoilt."""
+    data = walk.read_bytes()
+    path = out / f"bad.{'csv' if 'CSV' in kind else 'npz'}"
+    if kind == "truncated":
+        path.write_bytes(data[: len(data) // 2])
+    elif kind == "flipped":
+        begin = data.index(b"gravity.npy") + 40
+        path.write_bytes(data[:begin] + bytes(255 - b for b in data[begin:-2000]) + data[-2000:])
+    elif kind == "one array":
+        path = out / "bad.npy"
+        np.save(path, np.ones(12))
+    elif kind == "CSV without rows":
+        write_csv(path, list(columns(walk)), [[] for _ in columns(walk)])
+    elif kind == "CSV of longer rows":
+        path.write_text("time,goal_0\n0,1,2,3\n1,1,2,3\n")
+    elif kind == "CSV of nothing":
+        path.write_text("")
+    return path
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["truncated", "flipped", "one array", "CSV of nothing", "CSV without rows",
+     "CSV of longer rows"],
+)  # fmt: skip
+def test_a_damaged_log_is_one_line(
+    kind: str, folder: Path, walk: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(diagnose, "Controller", functools.partial(Controller, form=FORM))
+    out, flags = tmp_path / "out", ["--export", str(folder), "--outcome", "fell"]
+    assert diagnose.main([str(walk), *flags, "--out", str(out)]) == 0
+    assert (out / "diagnosis.csv").is_file()
+    capsys.readouterr()
+    path = damaged(walk, tmp_path, kind)
+    assert diagnose.main([str(path), *flags, "--out", str(tmp_path / "none")]) == 2
+    said = capsys.readouterr()
+    wrong = "missing, or neither an .npz nor a .csv of numbers"
+    if kind == "CSV without rows":
+        wrong = "needs two rows at least, each with its time"
+    assert (said.out, said.err) == ("", f"tdgc.diagnose: {path}: {wrong}\n")
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_diagnosis_that_cannot_be_written_is_one_line(
+    folder: Path, walk: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(diagnose, "Controller", functools.partial(Controller, form=FORM))
+    (tmp_path / "diagnosis.csv").mkdir()
+    flags = ["--export", str(folder), "--outcome", "fell", "--out", str(tmp_path)]
+    assert diagnose.main([str(walk), *flags]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("tdgc.diagnose: ") and said.err.count("\n") == 1
+    assert "Is a directory" in said.err

@@ -126,6 +126,34 @@ def test_baseline_holds_the_default_behaviour_parameters(low):
         loco.world.close()
 
 
+def test_baseline_keeps_to_the_ranges_that_it_is_given(low):
+    """Narrower than what its law asks for at a goal straight ahead and at one behind."""
+    narrow = dataclasses.replace(
+        CommandRanges(),
+        vx=(-0.3, 0.3),
+        yaw_rate=(-0.5, 0.5),
+        swing_height=(0.03, 0.1),
+        body_height=(-0.03, 0.0),
+        duration=(0.52, 0.6),
+    )
+    loco = Locomotion(2, low[1].robot, low[1].physics, None)
+    try:
+        driver = BaselineDriver(bounds=narrow)
+        assert driver.bounds == narrow
+        loco.place(np.arange(2), np.array([[0.0, 0.0], [0.0, 5.0]]), np.zeros(2), np.zeros(2))
+        driver.begin(loco, np.array([[6.5, 0.0], [-6.5, 4.9]]), "stair")
+        ahead, behind = driver.command(0)
+        expected = default_command()
+        for name, value in (("swing_height", 0.1), ("body_height", 0.0), ("duration", 0.52)):
+            expected[INDEX[name]] = value
+        expected[INDEX["vx"]] = 0.3
+        assert ahead == pytest.approx(expected)
+        expected[INDEX["vx"]], expected[INDEX["yaw_rate"]] = 0.0, -0.5
+        assert behind == pytest.approx(expected)
+    finally:
+        loco.world.close()
+
+
 # ------------------------------------------------------------------ tdgc
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import errno
 import json
 import math
 import re
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from tdgc.benchmark.evaluation import (
     BATCH,
     CONDITIONS,
     Cell,
+    complete,
     low_config,
     physics_of,
     plan,
@@ -28,8 +31,10 @@ from tdgc.benchmark.evaluation import (
     run_cell,
     tile_of,
 )
+from tdgc.benchmark.trace import Selection
 from tdgc.benchmark.tracking import track_gait
-from tdgc.config import RandomisationConfig
+from tdgc.config import CommandRanges, RandomisationConfig
+from tdgc.parallel.worker import WorkerError
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
@@ -83,6 +88,21 @@ def test_plan_has_every_cell_once_and_fewer_episodes_off_nominal():
     assert {k[2] for k in count if k[0] == "levels-11-12"} == {11, 12}
     assert {v for k, v in count.items() if k[0] != "nominal"} == {20}
     assert max(c.count for c in cells) == BATCH
+
+
+def test_a_cell_is_complete_with_all_of_its_batches(low, monkeypatch):
+    monkeypatch.setattr(evaluation, "BATCH", 1)
+    monkeypatch.setattr(evaluation, "HORIZON", 0.02)
+    cells = plan(["gp"], ["nominal", "pushes"], ["rough"], [6], 2)
+    assert [(c.condition, c.first) for c in cells] == [
+        ("nominal", 0),
+        ("nominal", 1),
+        ("pushes", 0),
+    ]
+    first, second, pushed = (run_cell(c, low, BaselineDriver(), seed=5)[0] for c in cells)
+    assert complete([first], cells) == []
+    assert complete([first, second], cells) == [first, second]
+    assert complete([first, pushed], cells) == [pushed]
 
 
 def test_conditions_are_the_benchmarks():
@@ -302,6 +322,19 @@ def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, cap
     assert capsys.readouterr().err == f"evaluate.py: {message}\n"
 
 
+ALONE = (
+    "--tracking is of the low policy alone, on a plane: "
+    "no --policies, --conditions, --families or --levels"
+)
+NOT_OF_TRACKING = (
+    ("--policies", "gp"),
+    ("--conditions", "nominal"),
+    ("--families", "all"),
+    ("--levels", "6-10"),
+)
+GUI_CONDITION = "--gui shows the nominal condition: no --conditions"
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
@@ -314,6 +347,14 @@ def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, cap
         (["--levels", "6-8,7"], "--levels '6-8,7' names a level twice"),
         (["--levels", "13"], "--levels '13' must name levels from 0 to 12"),
         (["--levels", "high"], "cannot read --levels 'high'; write e.g. 6-10 or 0,5,10"),
+        (["--levels", "6-"], "cannot read --levels '6-'; write e.g. 6-10 or 0,5,10"),
+        (["--levels", "9-6,3"], "--levels '9-6,3' must name levels from 0 to 12"),
+        (["--policies", ""], "unknown policy ''; allowed: all, tdgc, gp, cues, teacher"),
+        *((["--tracking", *flag], ALONE) for flag in NOT_OF_TRACKING),
+        *(
+            (["--gui", mode, "--conditions", "pushes"], GUI_CONDITION)
+            for mode in ("drive", "watch")
+        ),
         (["--workers", "0"], "--workers must be at least 1, not 0"),
         (["--seed", "-1"], "--seed must lie in [0, 2**32), not -1"),
         (["--high", "nowhere/high"], "nowhere/high.json: no such file"),
@@ -343,6 +384,132 @@ def test_an_evaluation_checks_itself():
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             dataclasses.replace(whole, **change)
+
+
+def test_the_baseline_keeps_to_what_the_low_policy_was_trained_on(low):
+    narrow = dataclasses.replace(CommandRanges(), vx=(-0.3, 0.3))
+    config = dataclasses.replace(low_config(low), commands=narrow)
+    asked = evaluate.Evaluation.of(evaluate.parse(["--policies", "gp", "--workers", "1"]))
+    assert asked.drivers(low, config)["gp"].bounds == narrow
+
+
+def test_the_robot_is_read_for_diagnoses_alone(low, monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 0.04)
+    read, robots = evaluate.read_geometry, []
+    monkeypatch.setattr(
+        evaluate, "read_geometry", lambda robot: robots.append(robot) or read(robot)
+    )
+    cell, drivers = Cell("gp", "nominal", "rough", 6, 0, 1), {"gp": BaselineDriver()}
+    plain = evaluate.run_one(cell, low, drivers, 5, 0, None)
+    assert (robots, plain.diagnoses, plain.traces) == ([], [], [])
+    traced = evaluate.run_one(cell, low, drivers, 5, 0, Selection.parse("failed"))
+    assert robots == [low_config(low).robot]
+    assert (
+        [d.outcome for d in traced.diagnoses] == [t.outcome for t in traced.traces] == ["timeout"]
+    )
+
+
+# ------------------------------------------------------------------ stopped
+
+RunJobs = Callable[[Callable[[Any], Any], Sequence[Any], int], Iterator[Any]]
+
+
+def stopped(after: int, error: BaseException) -> RunJobs:
+    """What shares jobs until ``error`` comes after some of them."""
+
+    def run_jobs(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:
+        yield from map(work, jobs[:after])
+        raise error
+
+    return run_jobs
+
+
+def answer(flags: list[str]) -> int | str | None:
+    """The script's exit status."""
+    try:
+        return evaluate.main(flags)
+    except SystemExit as end:
+        return end.code
+
+
+#: Two policies, two cells each, of two batches of an episode each.
+FOUR = ["--levels", "9,10", "--families", "gap", "--episodes", "2", "--workers", "1"]
+DIED = "a process died, perhaps for want of memory"
+BLOWN = "Cell(...): a robot's position is not finite"
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (KeyboardInterrupt(), "stopped by Ctrl-C"),
+        (WorkerError(DIED), DIED),
+        (FloatingPointError(BLOWN), BLOWN),
+        (FloatingPointError(f"Traceback\n  of a cluster\n{BLOWN}"), BLOWN),
+        (OSError(errno.ENOSPC, "No space left on device"), "[Errno 28] No space left on device"),
+    ],
+)
+def test_what_is_complete_is_kept(error, reason, high, tmp_path, monkeypatch, capsys):
+    """Stopped before the last batch: of the last cell half is missing."""
+    monkeypatch.setattr(evaluation, "BATCH", 1)
+    monkeypatch.setattr(evaluation, "HORIZON", 0.04)
+    monkeypatch.setattr(evaluate, "run_jobs", stopped(7, error))
+    assert answer([*FOUR, "--high", str(high), "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    lines = [line for line in said.err.splitlines() if line.startswith("evaluate.py")]
+    assert lines == [f"evaluate.py: {reason}; the table has 6 of 8 episodes"]
+    assert "Traceback" not in said.err
+    assert [(r["policy"], r["level"], r["episode"]) for r in rows_of(tmp_path)] == [
+        ("tdgc", "9", "0"), ("tdgc", "9", "1"), ("tdgc", "10", "0"), ("tdgc", "10", "1"),
+        ("gp", "9", "0"), ("gp", "9", "1"),
+    ]  # fmt: skip
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert list(summary) == ["tdgc", "gp", "editions"]  # on other tiles: not compared
+    assert summary["gp"]["nominal"]["mean"]["n"] == 2 and "gp, nominal" in said.out
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"episodes.csv", "summary.json", "trajectories.npz"}
+
+
+def test_without_a_complete_cell_there_is_no_table(tmp_path, monkeypatch, capsys):
+    """Nor is there what an earlier evaluation left."""
+    old = ["episodes.csv", "summary.json", "trajectories.npz", "report.html", "diagnosis.csv"]
+    old += ["success.png", "gaits.png", "headings.png", "trajectories.png", "notes.txt"]
+    for name in old:
+        (tmp_path / name).touch()
+    monkeypatch.setattr(evaluation, "BATCH", 1)
+    monkeypatch.setattr(evaluation, "HORIZON", 0.04)
+    monkeypatch.setattr(evaluate, "run_jobs", stopped(1, WorkerError(DIED)))
+    assert evaluate.main([*FOUR, "--policies", "gp", "--out", str(tmp_path)]) == 1
+    said = f"evaluate.py: {DIED}; no table, as 0 of 4 episodes are of complete cells"
+    assert capsys.readouterr().err.splitlines()[-1] == said
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_ctrl_c_stops_what_called_the_script_too(tmp_path, monkeypatch):
+    """The ablation would go on with its next trial."""
+    monkeypatch.setattr(evaluate, "run_jobs", stopped(0, KeyboardInterrupt()))
+    with pytest.raises(SystemExit):
+        evaluate.main([*FOUR, "--policies", "gp", "--out", str(tmp_path)])
+
+
+def test_a_tracking_that_is_stopped_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "run_jobs", stopped(0, FloatingPointError(BLOWN)))
+    assert evaluate.main(["--tracking", "--workers", "1", "--out", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"evaluate.py: {BLOWN}\n"
+
+
+def test_a_training_may_rewrite_the_policy_meanwhile(low, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 0.04)
+    high = save_high(tmp_path / "high", (low, low_config(low)), meta={"benchmark": 2})
+
+    def run_jobs(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:
+        high.with_suffix(".json").write_text("{", encoding="utf-8")
+        yield from map(work, jobs)
+
+    monkeypatch.setattr(evaluate, "run_jobs", run_jobs)
+    flags = ["--policies", "tdgc", "--high", str(high), "--out", str(tmp_path / "out")]
+    assert evaluate.main([*FOUR, *flags]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["editions"]["high"] == 2 and summary["tdgc"]["nominal"]["mean"]["n"] == 4
 
 
 def test_cues_are_a_policy_of_the_script(tmp_path, capsys):

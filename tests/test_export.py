@@ -20,7 +20,7 @@ from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
 from tdgc.deploy.controller import FORMATS, Graph
 from tdgc.deploy.graphs import HighGraph, LowGraph, by_command, foot_phases
-from tdgc.deploy.interface import ExportError
+from tdgc.deploy.interface import ExportError, checksum
 from tdgc.export import TOLERANCE
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
@@ -473,6 +473,10 @@ def test_interface_says_how_to_drive_the_joints(folder: Path) -> None:
 def test_interface_says_how_to_decide(folder: Path) -> None:
     table = json.loads((folder / "high_interface.json").read_text())
     assert table["rate"]["value"] == pytest.approx(10.0)
+    assert table["files"] == {
+        form: {"file": f"high{suffix}", "sha256": checksum(folder / f"high{suffix}")}
+        for form, suffix in FORMATS.items()
+    }
     assert table["order"] == [{"graph": "high", "every": 5}, {"graph": "low", "every": 1}]
     assert table["policy"] == {"seed": 7}
     assert table["families"][-1] == "unknown" and table["decision"][-1] == "gait"
@@ -541,6 +545,8 @@ def test_command_writes_checks_and_reports(
     high = random_high(tmp_path / "high", short)
     out = tmp_path / "new" / "out"
     arguments = ["--high", str(high), "--out", str(out), "--format", "torchscript"]
+    out.mkdir(parents=True)
+    (out / "low.onnx").write_text("of an earlier export, which other interfaces fit")
     assert export.main(arguments) == 0
     assert sorted(path.name for path in out.iterdir()) == [
         "high.pt", "high_interface.json", "low.pt", "low_interface.json", "quadruped.urdf"
@@ -555,6 +561,25 @@ def test_command_writes_checks_and_reports(
     said = capsys.readouterr()
     assert said.err.startswith("tdgc.export: torchscript differs by ")
     assert said.err.count("\n") == 1
+
+
+def test_a_robot_that_the_check_cannot_load_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its URDF names a mesh that is not there, which only a simulator asks for."""
+    shape, mesh = '<geometry><box size="0.3 0.15 0.1"/></geometry>', '<mesh filename="no.stl"/>'
+    text = urdf_path(LOW_CONFIG.robot).read_text()
+    assert shape in text
+    (tmp_path / "robot.urdf").write_text(text.replace(shape, f"<geometry>{mesh}</geometry>"))
+    robot = dataclasses.replace(LOW_CONFIG.robot, urdf=str(tmp_path / "robot.urdf"))
+    config = dataclasses.replace(LOW_CONFIG, robot=robot)
+    policies.save_copy(tmp_path / "low", LOW_POLICY, {}, {"config": to_dict(config)})
+    high = random_high(tmp_path / "high", HIGH_CONFIG, config, hidden=4)
+    flags = ["--low", str(tmp_path / "low"), "--high", str(high), "--format", "torchscript"]
+    assert export.main([*flags, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("tdgc.export: ") and said.err.count("\n") == 1
+    assert "robot.urdf: Bullet cannot load it" in said.err
 
 
 def save_pairs(path: Path) -> None:

@@ -513,7 +513,7 @@ def test_scripts_refuse_it_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixt
     for name, main, arguments in (
         ("train_low.py", train_low.main, train),
         ("evaluate.py", evaluate.main, table),
-        ("evaluate.py", evaluate.main, [*table, "--tracking"]),
+        ("evaluate.py", evaluate.main, ["--tracking", *table[8:]]),
     ):
         assert main(arguments) == 2
         assert capfd.readouterr().err == f"{name}: {path}: lacks the joints RR_hip_joint\n"

@@ -2,9 +2,11 @@
 
 import csv
 import dataclasses
+import errno
 import json
 import re
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import pytest
 
 from tdgc import diagnose, export
 from tdgc import mujoco as runner
-from tdgc.benchmark import trace
+from tdgc.benchmark import evaluation, trace
 from tdgc.benchmark.diagnosis import diagnose as judge
 from tdgc.benchmark.evaluation import Cell, tile_of
 from tdgc.benchmark.trace import NO_TILE, Tracer
@@ -23,6 +25,7 @@ from tdgc.config import ConfigError, RobotConfig
 from tdgc.deploy import log
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogError, LogWriter
+from tdgc.parallel.worker import WorkerError
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import nominal_height, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import TileField
@@ -428,6 +431,49 @@ def test_the_benchmark_writes_what_evaluate_writes(folder: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
+    ("after", "error", "message"),
+    [
+        (1, KeyboardInterrupt(), "stopped by Ctrl-C; the table has 1 of 2 episodes"),
+        (1, WorkerError("a process died"), "a process died; the table has 1 of 2 episodes"),
+        (
+            0,
+            OSError(errno.ENOSPC, "No space left on device"),
+            "[Errno 28] No space left on device; "
+            "no table, as 0 of 2 episodes are of complete cells",
+        ),
+    ],
+)
+def test_what_is_complete_when_it_is_stopped_is_kept(
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    after: int,
+    error: BaseException,
+    message: str,
+) -> None:
+    def run_jobs(work: Callable[[Cell], Any], jobs: Sequence[Cell], workers: int) -> Iterator[Any]:
+        yield from map(work, jobs[:after])
+        raise error
+
+    monkeypatch.setattr(runner, "run_jobs", run_jobs)
+    monkeypatch.setattr(evaluation, "HORIZON", 0.2)
+    for name in ("episodes.csv", "summary.json", "trajectories.npz"):
+        (tmp_path / name).touch()
+    flags = ["--levels", "9", "--families", "rough,gap", "--episodes", "1", "--workers", "1"]
+    assert runner.main(["--export", str(folder), *flags, "--out", str(tmp_path)]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1] == f"tdgc.mujoco: {message}" and "Traceback" not in "".join(lines)
+    tables = {path.name for path in tmp_path.iterdir()} - {"settings.json"}
+    if not after:
+        assert not tables
+        return
+    assert tables == {"episodes.csv", "summary.json", "trajectories.npz"}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert list(summary[runner.POLICY]["nominal"]) == ["rough", "mean"]
+
+
+@pytest.mark.parametrize(
     ("flags", "message"),
     [
         ("--export {0}/absent", "absent/low_interface.json: No such file"),
@@ -440,7 +486,7 @@ def test_the_benchmark_writes_what_evaluate_writes(folder: Path, tmp_path: Path)
         ("--set cone=round", "'cone' must be one of elliptic, pyramidal"),
         ("--set timestep=0.003", "'timestep' must divide the joint control's step"),
         ("--armature nan", "'armature' must be"),
-        ("--export {0}/old", "an interface of version 1, this package reads 2"),
+        ("--export {0}/old", "an interface of version 1, this package reads "),
         ("--export {0}/robot", "FL_calf_joint turns from -2.82 to -0.7 rad, that robot's from"),
     ],
 )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from tdgc.benchmark.evaluation import Episode, tile_of
 from tdgc.benchmark.results import write_results
@@ -50,6 +51,13 @@ def picture(path: Path) -> Array:
     pixels = matplotlib.image.imread(path)[..., :3]
     assert pixels.shape[0] > 200 and np.ptp(pixels) == 1.0
     return pixels
+
+
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that are drawn from now on, which are not written."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(plots, "_save", lambda figure, out: figures.append(figure))
+    return figures
 
 
 def share_of(pixels: Array, colour: str) -> float:
@@ -141,6 +149,17 @@ def test_trajectory_figure_has_a_row_a_family_on_its_hardest_level(tmp_path: Pat
     assert share_of(right, orange) > 0.002 > 0.0 == share_of(right, blue)
 
 
+@pytest.mark.parametrize("draw", [plots.gait_shares, plots.headings, plots.trajectories])
+def test_figures_of_another_condition_say_so(
+    draw: Callable[[Path, Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They show the first condition alone."""
+    figures = drawn(monkeypatch)
+    for conditions in (["nominal", "pushes"], ["pushes", "nominal"]):
+        draw(write(tmp_path, conditions), tmp_path / "figure.png")
+    assert [figure.get_suptitle() for figure in figures] == ["", "condition pushes"]
+
+
 def test_training_figure_skips_what_a_phase_does_not_log(tmp_path: Path) -> None:
     plane = {"steps": 100_000, "reward/total": 0.001, "tracking/trot_contact_match": 0.5}
     tiles = {"steps": 200_000, "reward/total": 0.002, "level/stair": 1.5}
@@ -183,3 +202,19 @@ def test_ablation_figure_has_a_bar_per_variant_as_long_as_its_rate(tmp_path: Pat
         shares.append(widest.max() / pixels.shape[1])
         assert len(pixels) == 120 * (1.0 + 0.3 * len([row for row in some if "n" in row]))
     assert shares[0] < 0.65 * shares[1] and shares[2] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("names", "lines"), [(["full", "trot"], [50.0]), (["trot", "full"], [80.0]), (["trot"], [])]
+)
+def test_ablation_figure_has_its_line_at_full(
+    names: list[str], lines: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever that is in the table, which may be without it."""
+    figures, cell = drawn(monkeypatch), {"what": "it", "n": 50, "seeds": {"1": 0.5}}
+    rates = [{"rate": r, "ci_low": r - 0.1, "ci_high": r + 0.1} for r in (0.5, 0.8)]
+    rows = [{"name": name} | cell | some for name, some in zip(names, rates, strict=False)]
+    (tmp_path / "ablation.json").write_text(json.dumps({"rows": rows}))
+    plots.ablation(tmp_path / "ablation.json", tmp_path / "ablation.png")
+    dotted = [line for line in figures[0].axes[0].lines if line.get_linestyle() == ":"]
+    assert [float(line.get_xdata()[0]) for line in dotted] == pytest.approx(lines)

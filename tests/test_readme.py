@@ -178,7 +178,7 @@ RAY = (
 #: Set-up and checks, which .ci/run runs as they stand or with all extras and all tests.
 BY_CI = (
     "python3 -m venv .venv",
-    ".venv/bin/pip install -c constraints.txt -e '.[video]'",
+    ".venv/bin/pip install -c constraints.txt -e '.[video,trace,export]'",
     "pip install -c constraints.txt -e '.[export,mujoco]'",
     ".venv/bin/pip install -c constraints.txt -e '.[dev]'",
     ".venv/bin/python -m pytest -n 2",

@@ -11,6 +11,7 @@ import pytest
 
 from tdgc.benchmark.evaluation import Episode
 from tdgc.benchmark.results import (
+    FILES,
     compare,
     describe,
     paired_interval,
@@ -133,6 +134,36 @@ def test_the_table_says_which_edition_a_policy_was_trained_on(tmp_path: Path) ->
     assert "the high policy" not in found
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["editions"] == {"tiles": 2, "low": 1, "high": 2}
+
+
+def test_policies_on_other_tiles_are_not_compared(tmp_path: Path) -> None:
+    """As a stopped evaluation leaves them: all of tdgc, and of gp and cues what came in time."""
+    cues = [dataclasses.replace(e, policy="cues") for e in EPISODES if e.policy == "tdgc"]
+    found = write_results(tmp_path, [*EPISODES[:-1], *cues])
+    assert list(found["paired"]) == ["tdgc - cues"]
+    assert list(found) == ["tdgc", "gp", "cues", "paired"]
+    assert "paired" not in write_results(tmp_path, EPISODES[:-1])
+
+
+def test_the_table_has_gaps_where_cells_are_missing(tmp_path: Path) -> None:
+    some = [*rows("gp", "rough", [True]), row("gp", "rough", 7, 0, "fell")]
+    lines = describe(write_results(tmp_path, [*some, *rows("gp", "gap", [True])])).splitlines()
+    assert [line.split() for line in lines[1:5]] == [
+        ["gp,", "nominal"],
+        ["family", "6", "7", "mean"],
+        ["rough", "100.0%", "0.0%", "50.0%"],
+        ["gap", "100.0%", "-", "100.0%"],
+    ]
+    assert len({len(line) for line in lines[2:5]}) == 1  # in columns
+
+
+def test_results_that_cannot_be_written_leave_those_of_before(tmp_path: Path) -> None:
+    write_results(tmp_path, EPISODES)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert set(before) == set(FILES)
+    with pytest.raises(ValueError):
+        write_results(tmp_path, [EPISODES[0], dataclasses.replace(EPISODES[1], shares=(1.0,))])
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_the_table_says_where_dominance_fails(tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""The ablation: variants of the hierarchy, their cells, the table."""
+"""The ablation: variants of the hierarchy, their trials, the table."""

@@ -6,7 +6,7 @@
 
 Each variant is a list of settings, trained by train_high.py from scratch and evaluated by
 evaluate.py; some are evaluated only, with the policy of ``full``. Stopped or killed at any moment,
-the same command goes on where it was, within a training too. A cell that fails is named with its
+the same command goes on where it was, within a training too. A trial that fails is named with its
 error, and the others are kept. Writes ``ablation.json``, ``ablation.txt`` and ``ablation.png``.
 
 It is run where the scripts are, in the root of the repository.
@@ -21,9 +21,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import evaluate
-from tdgc.ablate.cells import Cell, CellError, Runner, StoppedError
 from tdgc.ablate.table import Found, describe, rows
+from tdgc.ablate.trials import Runner, StoppedError, Tile, Trial, TrialError
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
@@ -36,11 +35,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.ablate", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--only", metavar="NAMES", help="some of the variants (all)")
-    parser.add_argument("--seeds", default="42", help="of the trainings, e.g. 42,43 (42)")
-    parser.add_argument("--steps", type=int, help="decisions of a training (train_high.py's own)")
-    parser.add_argument("--levels", default="6-10", help="that are evaluated (6-10)")
-    parser.add_argument("--episodes", type=int, default=100, help="of a family and level (100)")
+    names = ", ".join(variant.name for variant in variants(False))
+    parser.add_argument("--only", metavar="NAMES", help=f"comma-separated, of {names} (all)")
+    parser.add_argument("--seeds", default="42", help="training seeds, e.g. 42,43 (42)")
+    parser.add_argument("--steps", type=int, help="decisions per training (as train_high.py)")
+    parser.add_argument("--levels", default="6-10", help="levels to evaluate (6-10)")
+    parser.add_argument("--episodes", type=int, default=100, help="per family and level (100)")
     parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low policy (shipped)")
     parser.add_argument(
         "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one per core)"
@@ -51,9 +51,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
-        help="of all trainings, as train_high.py has it; may be repeated",
+        help="setting for all trainings, as in train_high.py; may be repeated",
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, default=Path("runs/ablation"), help="results folder")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/ablation"), help="results folder (runs/ablation)"
+    )
     return parser.parse_args(arguments)
 
 
@@ -83,33 +85,21 @@ def choose_seeds(text: str) -> list[int]:
         raise InputError(f"cannot read --seeds '{text}'; write e.g. 42,43") from None
 
 
-def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Cell]:
-    """All cells: one seed after the other, and what is not trained, but a script, once."""
+def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Trial]:
+    """All trials: one seed after the other, and what is not trained, but a script, once."""
     return [
-        Cell(variant, seed if variant.policy == "tdgc" else None)
+        Trial(variant, seed if variant.policy == "tdgc" else None)
         for seed in seeds
         for variant in chosen
         if variant.policy == "tdgc" or seed == seeds[0]
     ]
 
 
-def check(runner: Runner, chosen: Sequence[Variant]) -> None:
-    """Refuse before hours of training what would fail after them.
-
-    Raises:
-        ValueError: settings or flags that cannot be used.
-    """
-    for variant in chosen:
-        with_overrides(HighTrainConfig(), runner.training_settings(variant))
-    flags = runner.evaluation_flags("gp", runner.low, None)
-    evaluate.Evaluation.of(evaluate.parse([str(flag) for flag in flags]))
-
-
 def claim(runner: Runner) -> dict[str, Any]:
-    """What all cells in the folder have in common, written down by the first call.
+    """What all trials in the folder have in common, written down by the first call.
 
     Raises:
-        InputError: the folder holds cells that cannot be compared with these; or a low policy that
+        InputError: the folder holds trials that cannot be compared with these; or a low policy that
             cannot be used.
     """
     digest = hashlib.sha256()
@@ -130,6 +120,8 @@ def claim(runner: Runner) -> dict[str, Any]:
         path.write_text(json.dumps(common, indent=2), encoding="utf-8")
         return common
     before = read_json(path)
+    if not isinstance(before, dict):
+        raise InputError(f"{path}: not the settings of an ablation")
     for name, value in common.items():
         if before.get(name) != value:
             raise InputError(
@@ -140,11 +132,15 @@ def claim(runner: Runner) -> dict[str, Any]:
 
 
 def report(
-    out: Path, common: dict[str, Any], cells: Sequence[Cell], found: Mapping[Cell, Found]
+    out: Path,
+    common: dict[str, Any],
+    tiles: Sequence[Tile],
+    trials: Sequence[Trial],
+    found: Mapping[Trial, Found],
 ) -> str:
     """Write ablation.json, ablation.txt and ablation.png of what there is by now; returns the
     text."""
-    table = rows(out, cells, found)
+    table = rows(tiles, trials, found)
     text = json.dumps({"settings": common, "rows": table}, indent=2)
     (out / "ablation.json").write_text(text, encoding="utf-8")
     described = describe(table)
@@ -162,26 +158,27 @@ def main(arguments: list[str] | None = None) -> int:
     )  # fmt: skip
     try:
         chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
-        check(runner, chosen)
-        common = claim(runner)
+        for variant in chosen:  # before hours of training, what would fail after them
+            with_overrides(HighTrainConfig(), runner.training_settings(variant))
+        tiles, common = runner.tiles(), claim(runner)
     except (ValueError, OSError) as error:
         print(f"tdgc.ablate: {error}", file=sys.stderr)
         return 2
-    cells, found, stopped = plan(chosen, seeds), dict[Cell, Found](), False
-    for cell in cells:
-        print(f"{cell.name}: {cell.variant.what}", flush=True)
+    trials, found, stopped = plan(chosen, seeds), dict[Trial, Found](), False
+    for trial in trials:
+        print(f"{trial.name}: {trial.variant.what}", flush=True)
         try:
-            found[cell] = runner.run(cell)
-        except CellError as error:
-            found[cell] = str(error)
+            found[trial] = runner.run(trial)
+        except TrialError as error:
+            found[trial] = str(error)
         except StoppedError:
             stopped = True
             break
-        report(args.out, common, cells, found)
-    print(report(args.out, common, cells, found))
+        report(args.out, common, tiles, trials, found)
+    print(report(args.out, common, tiles, trials, found))
     if stopped:
         print("stopped; the same command goes on")
-    failed = {cell.name: message for cell, message in found.items() if isinstance(message, str)}
+    failed = {trial.name: message for trial, message in found.items() if isinstance(message, str)}
     for name, message in failed.items():
         print(f"tdgc.ablate: {name}: {message}", file=sys.stderr)
     return 1 if failed else 0

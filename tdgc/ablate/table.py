@@ -1,88 +1,129 @@
-"""The table of an ablation: cells -> rows, and rows as text.
+"""The table of an ablation: trials -> rows, and rows as text.
 
-Intervals are those of the tiles. How much a seed changes shows in the rates of the seeds alone.
+Rates are means over the tiles and over the seeds of a variant. Intervals are those of the tiles,
+with these seeds. How much a seed changes shows in the rates of the seeds alone.
 """
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from tdgc.ablate.cells import Cell
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.ablate.trials import Result, Tile, Trial
 from tdgc.ablate.variants import WHOLE
-from tdgc.benchmark.results import difference, rates
+from tdgc.benchmark.results import paired_interval, wilson_interval
 
-#: What a cell came to (``Runner.run``), or the message of its error.
-Found = dict[str, Any] | str
-_FACTS = ("steps", "train_seconds", "simulated_hours")
-
-
-def reached(folder: Path) -> dict[tuple[str, str, str], bool]:
-    """Family, level and number of each tile of a cell's evaluation -> whether its goal was
-    reached."""
-    with open(folder / "evaluation" / "episodes.csv", newline="", encoding="utf-8") as file:
-        return {
-            (row["family"], row["level"], row["episode"]): row["outcome"] == "reached"
-            for row in csv.DictReader(file)
-        }
+#: What a trial came to, or the message of its error.
+Found = Result | str
+_Z = 1.959964  # 95 % of a normal distribution are within so many deviations
 
 
-def rows(out: Path, cells: Sequence[Cell], found: Mapping[Cell, Found]) -> list[dict[str, Any]]:
+def rows(
+    tiles: Sequence[Tile], trials: Sequence[Trial], found: Mapping[Trial, Found]
+) -> list[dict[str, Any]]:
     """A row for each variant, over its seeds.
 
     Args:
-        out: where the cells' folders are.
-        cells: all, in order.
+        tiles: that each trial was evaluated on.
+        trials: all, in order.
         found: of those that were run.
 
     Returns:
-        Of each variant ``name``, ``what`` and ``errors``, seed -> message. If a cell is done also
-        n, reached, rate, ci_low and ci_high over all seeds; ``families`` and ``seeds``, each ->
-        rate; ``versus``: ``results.difference`` to ``full`` on the same tiles with the same seed;
-        and of a training, mean over the seeds, ``steps``, ``train_seconds``, ``simulated_hours``.
+        Of each variant ``name``, ``what`` and ``errors``, seed -> message. If a trial is done also
+        ``rates`` of its seeds; ``families`` and ``seeds``, each -> rate; ``versus``: ``difference``
+        to ``full`` with the same seed; and of a training ``FACTS``, means over the seeds.
     """
-    done = {cell: reached(out / cell.name) for cell, f in found.items() if isinstance(f, dict)}
-    whole = {cell.seed: tiles for cell, tiles in done.items() if cell.variant.name == WHOLE}
+    of = np.array([family for family, _, _ in tiles])
+    done = {trial: result for trial, result in found.items() if isinstance(result, Result)}
+    whole = {trial.seed: r.reached for trial, r in done.items() if trial.variant.name == WHOLE}
     table = []
-    for variant in dict.fromkeys(cell.variant for cell in cells):
-        mine = [cell for cell in cells if cell.variant == variant]
+    for variant in dict.fromkeys(trial.variant for trial in trials):
+        mine = [trial for trial in trials if trial.variant == variant]
         row: dict[str, Any] = {"name": variant.name, "what": variant.what}
-        tiles = {cell: done[cell] for cell in mine if cell in done}
-        if tiles:
-            every = [(where, yes) for some in tiles.values() for where, yes in some.items()]
-            families = dict.fromkeys(family for (family, _, _), _ in every)
-            row |= rates(yes for _, yes in every)
+        results = {trial: done[trial] for trial in mine if trial in done}
+        if results:
+            reached = np.array([result.reached for result in results.values()])
+            row |= rates(reached)
             row["families"] = {
-                family: rates(yes for where, yes in every if where[0] == family)["rate"]
-                for family in families
+                family: float(reached[:, of == family].mean())
+                for family in dict.fromkeys(of.tolist())
             }
-            row["seeds"] = {str(c.seed): rates(some.values())["rate"] for c, some in tiles.items()}
+            row["seeds"] = {str(t.seed): float(r.reached.mean()) for t, r in results.items()}
             pairs = [
-                (yes, other[where])
-                for cell, some in tiles.items()
+                (result.reached, other)
+                for trial, result in results.items()
                 for seed, other in whole.items()
-                if cell.seed in (seed, None)
-                for where, yes in some.items()
+                if trial.seed in (seed, None)  # a script has none, and meets all of them
             ]
-            row["versus"] = difference(pairs) if pairs and variant.name != WHOLE else None
-            for key in _FACTS if variant.settings is not None else ():
-                row[key] = mean(_facts(found[cell])[key] for cell in tiles)
-        row["errors"] = {str(c.seed): found[c] for c in mine if isinstance(found.get(c), str)}
+            row["versus"] = None
+            if pairs and variant.name != WHOLE:
+                first, second = (np.array(side) for side in zip(*pairs, strict=True))
+                row["versus"] = difference(first, second)
+            facts = [result.facts for result in results.values()]
+            row |= {name: mean(each[name] for each in facts) for name in facts[0]}
+        row["errors"] = {str(t.seed): found[t] for t in mine if isinstance(found.get(t), str)}
         table.append(row)
     return table
 
 
-def _facts(found: Found) -> dict[str, Any]:
-    assert isinstance(found, dict)
-    return found
+def rates(reached: NDArray[np.bool_]) -> dict[str, float]:
+    """Of n tiles, each with whether the goal was reached with each seed, (seeds, n): how many tiles
+    (n), ``reached`` of them, the mean over the seeds, ``rate``, and its interval ci_low, ci_high.
+    """
+    seeds, n = reached.shape
+    good = int(reached.sum())
+    low, high = wilson_interval(good, reached.size, _Z * wider(reached))
+    return {
+        "n": n,
+        "reached": good / seeds,
+        "rate": good / reached.size,
+        "ci_low": low,
+        "ci_high": high,
+    }
+
+
+def difference(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str, float]:
+    """The same of two variants on the same tiles, (seeds, n) each: how many tiles (n), gained and
+    lost (only the first, only the second reached the goal, means over the seeds), the
+    ``difference`` of the rates and its interval ci_low, ci_high."""
+    seeds, n = first.shape
+    both, gained, lost, neither = (
+        int(tiles.sum())
+        for tiles in (first & second, first & ~second, ~first & second, ~first & ~second)
+    )
+    z = _Z * wider(first.astype(float) - second)
+    low, high = paired_interval(both, gained, lost, neither, z)
+    return {
+        "n": n,
+        "gained": gained / seeds,
+        "lost": lost / seeds,
+        "difference": (gained - lost) / first.size,
+        "ci_low": low,
+        "ci_high": high,
+    }
+
+
+def wider(values: NDArray[Any]) -> float:
+    """How much wider the interval of a mean over ``values`` (seeds, n) is than if every one of them
+    were of a tile of its own.
+
+    The root of the design effect of a sample in clusters, which here are the seeds on a tile: 1
+    with one seed or where a tile decides nothing, the root of the number of seeds where all of them
+    do the same.
+    """
+    spread = values.var()
+    share = values.mean(axis=0).var() / spread if spread > 0.0 else 1.0  # due to the tiles
+    return max(1.0, float(np.sqrt(len(values) * share)))
 
 
 def describe(table: Sequence[dict[str, Any]]) -> str:
     """Rows as text, with the errors below them."""
     families = list(next((row["families"] for row in table if "n" in row), {}))
     wide = max(len(row["name"]) for row in table) + 1
-    head = f"{'variant':<{wide}}{'n':>6}{'success':>9}{'95 %':>15}{'against full':>22}"
+    head = f"{'variant':<{wide}}{'tiles':>6}{'success':>9}{'95 %':>15}{'against full':>22}"
     head += "".join(f"{Path(family).stem[:8]:>9}" for family in families)
     lines = [f"{head}{'steps':>9}{'hours':>7}"]
     for row in table:

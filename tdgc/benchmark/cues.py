@@ -89,7 +89,7 @@ class CuesLaw:
     def predict(
         self, obs: NDArray[np.floating], state: Memory | None = None
     ) -> tuple[Array, Memory]:
-        """Actions (M, 13) from o^H (M, 91), and what is remembered for the next decision."""
+        """Actions (M, 13) from o^H (M, size), and what is remembered for the next decision."""
         rows = np.asarray(obs, dtype=np.float64)
         cue = {name: rows[:, place] for name, place in self._columns.items()}
         distance = cue["goal"][:, 0] / GOAL_SCALE

@@ -87,12 +87,21 @@ class GoToGoal:
 
 
 class BaselineDriver(Driver):
-    """Drives robots by ``GoToGoal``, anew at every control step; it knows no families."""
+    """Drives robots by ``GoToGoal``, anew at every control step; it knows no families.
 
-    def __init__(self, law: GoToGoal | None = None) -> None:
+    Commands of the law outside ``bounds`` are clipped to them: it has one setting for all low
+    policies.
+
+    Args:
+        law: the script.
+        bounds: what the low policy was trained on; the ranges of ``CommandRanges`` by default.
+    """
+
+    def __init__(self, law: GoToGoal | None = None, bounds: CommandRanges | None = None) -> None:
         self.law = law or GoToGoal()
         self.config = HighLevelConfig(cues="none")
-        self.bounds = CommandRanges()
+        self.bounds = bounds or CommandRanges()
+        self._decoder = CommandDecoder(self.bounds)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
@@ -104,7 +113,8 @@ class BaselineDriver(Driver):
         state = self._loco.world.state
         speed, turn = self.law.law(state.position[:, :2], state.yaw, self._goal)
         self._command[:, INDEX["vx"]], self._command[:, INDEX["yaw_rate"]] = speed, turn
-        return self._command
+        low, high = self._decoder.low, self._decoder.high
+        return np.clip(self._command, low, high, out=self._command)
 
 
 class TeacherDriver(Driver):

@@ -7,6 +7,7 @@ the table.
 
 import dataclasses
 import itertools
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, recorded
+from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig
 from tdgc.policies import Policy
 from tdgc.sim.commands import gait_index
 from tdgc.sim.gaits import GAITS
@@ -34,6 +35,7 @@ from tdgc.sim.terrain import (
 )
 from tdgc.sim.world import World
 from tdgc.tasks.executor import Carries, Executor
+from tdgc.tasks.high_env import load_low
 from tdgc.tasks.rules import GOING, HORIZON, OUTCOMES, outcome
 
 BATCH = 50  # episodes a world: enough to keep numpy busy, few enough to share out evenly
@@ -165,11 +167,9 @@ def low_config(low: Policy) -> LowLevelConfig:
     """The MDP that a low policy was trained on, from its own file.
 
     Raises:
-        ValueError: the file holds none, or one that does not fit the policy.
+        ValueError: it is no low policy.
     """
-    if "config" not in low.meta:
-        raise ValueError("the low policy's file has no configuration")
-    return recorded(LowLevelConfig, low.meta["config"], "the low policy's configuration")
+    return load_low(low)[1]
 
 
 def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
@@ -421,3 +421,21 @@ def plan(
                         size = min(BATCH, count - first)
                         cells.append(Cell(policy, name, family, level, first, size))
     return cells
+
+
+def complete(episodes: Sequence[Episode], cells: Sequence[Cell]) -> list[Episode]:
+    """The episodes of those policies, conditions, families and levels that have all of theirs.
+
+    Args:
+        episodes: that have been run.
+        cells: all batches of the evaluation.
+    """
+
+    def where(of: Episode | Cell) -> tuple[str, str, str, int]:
+        return of.policy, of.condition, of.family, of.level
+
+    planned = Counter[tuple[str, str, str, int]]()
+    for cell in cells:
+        planned[where(cell)] += cell.count
+    ended = Counter(map(where, episodes))
+    return [e for e in episodes if ended[where(e)] == planned[where(e)]]

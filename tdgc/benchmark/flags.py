@@ -20,14 +20,17 @@ class Groups(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
-    """Flags that ``read`` reads; ``out`` is where results go by default."""
+    """Flags that ``read`` reads; ``out`` is where results go by default.
+
+    Levels and families are None if they are not given, until ``read`` fills in the default: so a
+    script can refuse them where they would say nothing.
+    """
     titles = "episodes", "policies", "what is looked at", "machine"
     groups = Groups(*map(parser.add_argument_group, titles))
     add = groups.episodes.add_argument
-    add("--levels", default="6-10", help="e.g. 6-10 or 0,5,10 (6-10)")
+    add("--levels", help="e.g. 6-10 or 0,5,10 (6-10)")
     add(
         "--families",
-        default="all",
         help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING} (all)",
     )
     add("--episodes", type=int, default=100, help="per cell (100)")
@@ -59,9 +62,10 @@ def read(args: argparse.Namespace) -> None:
         ValueError: flags that cannot be used, or a file of heights that cannot.
         OSError: a file of heights that cannot be read.
     """
-    args.levels = choose_levels(args.levels)
-    maps = tuple(filter(is_map, args.families.split(",")))
-    args.families = choose(args.families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
+    args.levels = choose_levels("6-10" if args.levels is None else args.levels)
+    families = "all" if args.families is None else args.families
+    maps = tuple(filter(is_map, families.split(",")))
+    args.families = choose(families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
     for name in maps:
         height_map(name)
     args.workers = usable_cores() if args.workers == "auto" else args.workers
@@ -97,16 +101,17 @@ def choose_levels(text: str) -> tuple[int, ...]:
     Raises:
         ValueError: not numbers, outside 0-12, or one of them twice.
     """
-    levels: list[int] = []
+    spans: list[range] = []
     for part in text.split(","):
-        first, _, last = part.partition("-")
+        first, dash, last = part.partition("-")
         try:
-            levels += range(int(first), int(last or first) + 1)
+            spans.append(range(int(first), int(last if dash else first) + 1))
         except ValueError as error:
             raise ValueError(f"cannot read --levels '{text}'; write e.g. 6-10 or 0,5,10") from error
     top = OOD_LEVELS[-1]
-    if not levels or min(levels) < 0 or max(levels) > top:
+    if not all(span and span[0] >= 0 and span[-1] <= top for span in spans):
         raise ValueError(f"--levels '{text}' must name levels from 0 to {top}")
+    levels = [level for span in spans for level in span]
     if len(set(levels)) < len(levels):
         raise ValueError(f"--levels '{text}' names a level twice")
     return tuple(levels)

@@ -1,17 +1,24 @@
 """Results: episodes -> rates with their intervals, and the files of a results folder."""
 
+import contextlib
 import csv
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tdgc.benchmark.evaluation import Episode
+from tdgc.benchmark.evaluation import Cell, Episode, complete
+from tdgc.files import atomic
+from tdgc.parallel.worker import WorkerError
 from tdgc.sim.terrain import EDITION
 
+#: Files of ``write_results``.
+FILES = ("episodes.csv", "summary.json", "trajectories.npz")
+#: What may stop episodes under way: Ctrl-C, a robot that blows up, a full disk, a dead process.
+STOPS = (KeyboardInterrupt, FloatingPointError, OSError, WorkerError)
 #: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and of
 #: which edition of the benchmark the tiles are and those that the policies were trained on.
 PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
@@ -209,11 +216,12 @@ def _differences(families: dict[str, Any], pair: str = "") -> list[str]:
 
 def _rates(families: dict[str, Any]) -> list[str]:
     names = [f for f in families if f != "mean"]
-    levels = list(families[names[0]])
+    levels = list(dict.fromkeys(level for name in names for level in families[name]))
     wide = max(8, *(len(name) + 1 for name in names))
     lines = ["family".ljust(wide) + "".join(f"{level:>8}" for level in levels)]
     for name in names:
-        cells = "".join(f"{100 * families[name][level]['rate']:7.1f}%" for level in levels)
+        found = [families[name].get(level) for level in levels]  # None where it was stopped
+        cells = "".join(f"{100 * cell['rate']:7.1f}%" if cell else f"{'-':>8}" for cell in found)
         lines.append(name.ljust(wide) + cells)
     mean = families["mean"]
     rate, low, high = (100 * mean[key] for key in ("rate", "ci_low", "ci_high"))
@@ -227,27 +235,82 @@ def write_results(
     """Write episodes.csv, summary.json and trajectories.npz into ``folder``; returns the summary.
 
     ``editions`` are those of the benchmark that policies were trained on, by what they are called.
+    Policies that were not on the same tiles are not compared.
 
     trajectories.npz holds the tracks in the order of episodes.csv: ``poses`` (N, 3), those of all
     episodes one after another, ``counts`` (E,), how many are each one's, and ``goals`` (E, 2).
     """
-    with open(folder / "episodes.csv", "w", newline="", encoding="utf-8") as file:
+    with (
+        atomic(folder / "episodes.csv") as partial,
+        open(partial, "w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.DictWriter(file, list(episodes[0].row()))
         writer.writeheader()
         writer.writerows(e.row() for e in episodes)
-    np.savez_compressed(
-        folder / "trajectories.npz",
-        poses=np.concatenate([e.track for e in episodes]).astype(np.float32),
-        counts=np.array([len(e.track) for e in episodes], dtype=np.int32),
-        goals=np.array([e.goal for e in episodes], dtype=np.float32),
-    )
+    # NumPy would append its suffix to a name.
+    with atomic(folder / "trajectories.npz") as partial, open(partial, "wb") as tracks:
+        np.savez_compressed(
+            tracks,
+            poses=np.concatenate([e.track for e in episodes]).astype(np.float32),
+            counts=np.array([len(e.track) for e in episodes], dtype=np.int32),
+            goals=np.array([e.goal for e in episodes], dtype=np.float32),
+        )
     summary = summarise(episodes)
-    pairs = [pair for pair in _PAIRS if set(pair) <= summary.keys()]
+
+    def tiles(policy: str) -> set[tuple[str, str, int, int]]:
+        mine = (e for e in episodes if e.policy == policy)
+        return {(e.condition, e.family, e.level, e.episode) for e in mine}
+
+    pairs = [
+        (first, second)
+        for first, second in _PAIRS
+        if {first, second} <= summary.keys() and tiles(first) == tiles(second)
+    ]
     if pairs:
         summary[PAIRED] = {" - ".join(pair): compare(episodes, *pair) for pair in pairs}
     if found := sides(episodes):
         summary[SIDES] = found
     if editions:
         summary[EDITIONS] = {"tiles": EDITION, **editions}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
+    with atomic(folder / "summary.json") as partial:
+        partial.write_text(json.dumps(summary, indent=2), encoding="utf-8")
     return summary
+
+
+# ---------------------------------------------------------------------------- stopped episodes
+
+
+@contextlib.contextmanager
+def salvage(
+    folder: Path,
+    episodes: Sequence[Episode],
+    cells: Sequence[Cell],
+    editions: Mapping[str, int] | None = None,
+) -> Iterator[None]:
+    """Run episodes within it: if one of ``STOPS`` stops them, what is ``complete`` is kept.
+
+    The table of that is written and printed, and a note of the exception, which is raised on, says
+    how many episodes it has.
+
+    Args:
+        folder, editions: as for ``write_results``.
+        episodes: those that have ended; it grows meanwhile.
+        cells: all batches of the evaluation.
+    """
+    try:
+        yield
+    except STOPS as error:
+        done, total = complete(episodes, cells), sum(cell.count for cell in cells)
+        if done:
+            print(describe(write_results(folder, done, editions)))
+            error.add_note(f"the table has {len(done)} of {total} episodes")
+        else:
+            error.add_note(f"no table, as 0 of {total} episodes are of complete cells")
+        raise
+
+
+def what_stopped(error: BaseException) -> str:
+    """One line about one of ``STOPS``, with its notes."""
+    said = str(error).rpartition("\n")[-1]  # a cluster's errors begin with a traceback
+    said = "stopped by Ctrl-C" if isinstance(error, KeyboardInterrupt) else said
+    return "; ".join([said, *getattr(error, "__notes__", ())])

@@ -367,7 +367,12 @@ def _about(field: Any) -> dict[str, str]:
 
 
 def write(trace: Trace, folder: str | Path) -> Path:
-    """Write ``trace`` into ``folder`` under its ``file_name``, whole or not at all; its path."""
+    """Write ``trace`` into ``folder`` under its ``file_name``, whole or not at all; its path.
+
+    Raises:
+        InputError: pyarrow is not installed.
+        OSError: the file cannot be written.
+    """
     require("a trace", ("pyarrow",), "trace")
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -1,7 +1,7 @@
 """The low policy alone, on a plane: how it tracks commands in each gait, how often it falls."""
 
-import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -103,9 +103,8 @@ def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
     return {"falls": falls, "minutes": minutes, "falls_per_10_min": 10.0 * falls / minutes}
 
 
-def _track(job: tuple[str, int, int], low: Policy) -> dict[str, float]:
-    gait, episodes, seed = job
-    return track_gait(low, gait, episodes, seed) if gait else count_falls(low, episodes, seed)
+def _run(measure: Callable[[Policy], dict[str, float]], low: Policy) -> dict[str, float]:
+    return measure(low)
 
 
 def tracking(
@@ -113,7 +112,7 @@ def tracking(
 ) -> dict[str, Any]:
     """tracking.json: each gait's tracking and the falls; ``run`` is where the work is done."""
     robots = max(1, round(_FALL_SHARE * episodes))
-    jobs = [(gait, episodes, seed) for gait in GAITS] + [("", robots, seed)]
-    results = list(run(functools.partial(_track, low=low), jobs, workers))
-    falls = results.pop()
-    return {"gaits": dict(zip(GAITS, results, strict=True)), **falls}
+    jobs = [partial(track_gait, gait=gait, episodes=episodes, seed=seed) for gait in GAITS]
+    jobs.append(partial(count_falls, robots=robots, seed=seed))
+    *gaits, falls = run(partial(_run, low=low), jobs, workers)
+    return {"gaits": dict(zip(GAITS, gaits, strict=True)), **falls}

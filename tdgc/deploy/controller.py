@@ -51,7 +51,7 @@ class Graph:
         self._outputs = [s["name"] for s in self.table["outputs"]]
         self._kept = {s["name"]: s["previous"] for s in inputs if s["previous"] is not None}
         self._start = {s["name"]: _start(s) for s in inputs if s["start"] is not None}
-        self._run = _RUNTIMES[form](folder / (name + FORMATS[form]), self.table)
+        self._run = _RUNTIMES[form](graph_file(folder, self.table, form), self.table)
         self.reset()
 
     def reset(self) -> None:
@@ -82,6 +82,30 @@ class Graph:
         return made
 
 
+def graph_file(folder: Path, table: Table, form: str) -> Path:
+    """The file of a graph, seen to be the one that its interface file was written with.
+
+    Raises:
+        ExportError: none of this format, or it is missing, or another one.
+    """
+    files = table["files"]
+    if form not in files:
+        raise ExportError(
+            f"{folder}: its {table['graph']} policy was exported as {', '.join(files)}, not {form}"
+        )
+    path = folder / files[form]["file"]
+    try:
+        same = checksum(path) == files[form]["sha256"]
+    except OSError as error:
+        raise ExportError(f"{path}: {error.strerror}") from error
+    if not same:
+        raise ExportError(
+            f"{path}: not the graph that {table['graph']}_interface.json was written with; export "
+            "the policies again"
+        )
+    return path
+
+
 def _start(signal: Table) -> Array:
     """What an input is in the first step."""
     return np.broadcast_to(np.array(signal["start"], dtype=np.float64), signal["shape"]).copy()
@@ -95,7 +119,7 @@ def _open_onnx(path: Path, table: Table) -> Run:
     try:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # its classes have no common one of their own
-        raise ExportError(f"{path}: missing, or no ONNX graph") from error
+        raise ExportError(f"{path}: no ONNX graph") from error
     for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
         if [(s["name"], s["shape"]) for s in table[side]] != [(x.name, x.shape) for x in found]:
             raise ExportError(f"{path}: its {side} are not those of its interface file")
@@ -110,7 +134,7 @@ def _open_torchscript(path: Path, table: Table) -> Run:
         with quiet():
             module = th.jit.load(path)  # type: ignore[no-untyped-call]
     except (RuntimeError, ValueError, OSError) as error:
-        raise ExportError(f"{path}: missing, or no TorchScript graph") from error
+        raise ExportError(f"{path}: no TorchScript graph") from error
 
     def run(values: list[Array]) -> list[Array]:
         with th.inference_mode():

@@ -14,7 +14,7 @@ from tdgc.config import read_json
 from tdgc.errors import InputError
 
 #: Of the interface files; any change of what they hold is a new one.
-VERSION = 2
+VERSION = 3
 SCHEMA = Path(__file__).with_name("interface.schema.json")
 
 Table = dict[str, Any]

@@ -3,11 +3,12 @@
 A log has a row per control step, from the first of an episode on, and a last row with what was
 sensed after the last step. It is what a real robot can write down. A trace can be made of it,
 without what only a simulator knows, and diagnosed: ``tdgc.diagnose``. A file is ``.npz``, with an
-array (rows, size) per value, or ``.csv``, with a column per entry, ``gravity_0``. docs/mujoco.md
+array (rows, size) per value, or ``.csv``, with a column per entry, ``gravity_0``. docs/deploy.md
 lists the values.
 """
 
 import csv
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,11 @@ class LogWriter:
         self._rows.append(whole | {"time": np.array(step * self._controller.dt)})
 
     def save(self, path: Path) -> None:
-        """Write all into an ``.npz``."""
+        """Write all into an ``.npz``.
+
+        Raises:
+            OSError: it cannot be written.
+        """
         columns = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
         np.savez_compressed(path, allow_pickle=False, **columns)
 
@@ -113,11 +118,15 @@ def read(path: Path, controller: Controller) -> Log:
     """The log in a file, of a robot that the controller's folder was on.
 
     Raises:
-        LogError: no such file, one that lacks values or rows, or values that are no numbers.
+        LogError: no such file, one that is damaged or lacks values or rows, or values that are no
+            numbers.
     """
+    known = {"time", *layout(controller)}
     try:
-        table = _read_csv(path) if path.suffix == ".csv" else dict(np.load(path))
-    except (OSError, ValueError, EOFError, StopIteration) as error:
+        table = _read_csv(path, known) if path.suffix == ".csv" else _read_npz(path)
+    except LogError:
+        raise
+    except Exception as error:  # numpy and zipfile raise all kinds of them on damaged files
         raise LogError(f"{path}: missing, or neither an .npz nor a .csv of numbers") from error
     taken = [signal["name"] for signal in controller.low.table["inputs"]]
     left_out = [name for name in OPTIONAL if name not in table and name not in taken]
@@ -139,16 +148,40 @@ def read(path: Path, controller: Controller) -> Log:
     return log
 
 
-def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
-    """Values by name; an empty cell is NaN."""
+def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """Values by name."""
+    with np.load(path) as file:
+        return dict(file)
+
+
+def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
+    """Values by name, of those ``known``, in the order of the numbers in the columns' names; an
+    empty cell is NaN.
+
+    Raises:
+        LogError: the same column twice, or none for a number.
+    """
     with open(path, newline="", encoding="utf-8") as file:
-        lines = csv.reader(file)
-        header = next(lines)
-        cells = np.array([[float(cell or "nan") for cell in line] for line in lines])
-    places: dict[str, list[int]] = {}
+        header, *lines = csv.reader(file)
+    cells = np.array([[float(cell or "nan") for cell in line] for line in lines])
+    cells = cells.reshape(len(lines), len(header))
+    places: dict[str, dict[int, int]] = {}
     for place, column in enumerate(header):
-        places.setdefault(column.rstrip("0123456789").removesuffix("_"), []).append(place)
-    table = {name: cells[:, mine] for name, mine in places.items()}
+        name, _, number = column.rpartition("_")
+        if not (number.isascii() and number.isdigit()):
+            name, number = column, "0"  # of a single value, as the time is
+        if name not in known:
+            continue
+        mine = places.setdefault(name, {})
+        if int(number) in mine:
+            raise LogError(f"{path}: the column '{column}' stands twice")
+        mine[int(number)] = place
+    table = {}
+    for name, mine in places.items():
+        missing = set(range(len(mine))) - mine.keys()
+        if missing:
+            raise LogError(f"{path}: no column '{name}_{min(missing)}', but '{name}_{max(mine)}'")
+        table[name] = cells[:, [mine[k] for k in range(len(mine))]]
     return table | {"time": table["time"][:, 0]} if "time" in table else table
 
 

@@ -24,7 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, uni
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
         help="override a setting of tdgc/config, e.g. ppo.n_epochs=4; may be repeated",
     )  # fmt: skip
-    training.add_argument("--init", type=Path, help="start from this policy instead of from scratch")
+    training.add_argument(
+        "--init", type=Path, help="start from this policy instead of from scratch"
+    )
     run = parser.add_argument_group("run")
     run.add_argument("--out", type=Path, default=Path(out), help=f"run folder ({out})")
     run.add_argument("--resume", action="store_true", help="continue the run in --out")

@@ -116,9 +116,6 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
             self.lstm_output_dim, self.net_arch, self.activation_fn, self.device
         )
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "mirror": self.mirror}
-
     def forward(  # type: ignore[override]  # as sb3-contrib has it
         self,
         obs: th.Tensor,

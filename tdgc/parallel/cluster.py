@@ -34,8 +34,8 @@ _RESTARTS, _PAUSE_SECONDS = 10, 1.0
 
 #: Of the flag ``--cluster``.
 CLUSTER_HELP = (
-    "simulate in this cluster of Ray: host:port, or auto for the one that RAY_ADDRESS names or "
-    "that runs on this machine"
+    "simulate on this Ray cluster: host:port, or auto for the one in RAY_ADDRESS, or else the one "
+    "on this machine"
 )
 
 Job = TypeVar("Job")

@@ -222,8 +222,5 @@ def save_copy(
     for name, tensor in changed.items():
         if name not in policy.tensors or tensor.shape != policy.tensors[name].shape:
             raise ValueError(f"no tensor {name} of shape {tuple(tensor.shape)} in this policy")
-    tensors = {
-        name: changed.get(name, tensor).detach().to("cpu", th.float32).contiguous()
-        for name, tensor in policy.tensors.items()
-    }
-    store(path, dataclasses.replace(policy.header, meta=meta), tensors)
+    header = dataclasses.replace(policy.header, meta=meta)
+    store(path, header, policy.tensors | dict(changed))

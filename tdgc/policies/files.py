@@ -291,6 +291,20 @@ def _bounds(value: Any, count: int, unbounded: float, name: str) -> tuple[float,
 
 
 def store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Tensor]) -> None:
+    """Write both files of a policy, each whole or not at all, weights first.
+
+    Args:
+        path: with or without one of the two suffixes; missing folders are made.
+        header: what the JSON file says.
+        tensors: by name, of ``header.shapes()``, on any device; written as float32.
+
+    Raises:
+        ValueError: weights that are not finite, or a header that could not be read back.
+        OSError: the files cannot be written.
+    """
+    tensors = {
+        name: tensor.detach().to("cpu", th.float32).contiguous() for name, tensor in tensors.items()
+    }
     for name, tensor in tensors.items():
         if not bool(tensor.isfinite().all()):
             raise ValueError(f"tensor {name} holds a number that is not finite; not saved")
@@ -336,6 +350,15 @@ def _read_bytes(path: Path, limit: int) -> bytes:
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
+    """What ``store`` wrote: the header, and the tensors by name, float32 in main memory.
+
+    Args:
+        path: with or without one of the two suffixes.
+
+    Raises:
+        PolicyFileError: a file that is missing, damaged, too large, or that the other one does not
+            fit; the message names it.
+    """
     stem = _stem(path)
     header_path, weights_path = _with_suffix(stem, ".json"), _with_suffix(stem, ".safetensors")
     try:

@@ -225,10 +225,6 @@ class AsymmetricActorCriticPolicy(ActorCriticPolicy):
         distribution = cast(DiagGaussianDistribution, self.action_dist)
         return distribution.proba_distribution(self.action_net(latent_pi), self.symmetric_log_std())
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = {"actor_dim": self.actor_dim, "mirror": self.mirror}
-        return {**super()._get_constructor_parameters(), **own}
-
 
 def save(path: str | os.PathLike[str], policy: ActorCriticPolicy, meta: dict[str, Any]) -> None:
     """Write ``policy`` as ``path.safetensors`` and ``path.json``.
@@ -249,12 +245,7 @@ def save(path: str | os.PathLike[str], policy: ActorCriticPolicy, meta: dict[str
             cannot say; nothing is written then.
         OSError: the files cannot be written.
     """
-    header = _describe(policy, meta)
-    tensors = {
-        name: tensor.detach().to("cpu", th.float32).contiguous()
-        for name, tensor in _tensors(policy).items()
-    }
-    store(path, header, tensors)
+    store(path, _describe(policy, meta), _tensors(policy))
 
 
 def load_into(path: str | os.PathLike[str], policy: ActorCriticPolicy) -> dict[str, Any]:

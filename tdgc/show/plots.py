@@ -65,7 +65,7 @@ def _caption(figure: Figure, text: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """An episode as ``tdgc.benchmark.evaluation.write_results`` left it: its row, goal (2,), track
+    """An episode as ``tdgc.benchmark.results.write_results`` left it: its row, goal (2,), track
     (n, 3)."""
 
     row: dict[str, str]
@@ -81,6 +81,13 @@ def _read(folder: Path) -> list[_Run]:
         tracks = np.split(data["poses"], np.cumsum(data["counts"])[:-1])
         runs = [_Run(*parts) for parts in zip(rows, data["goals"], tracks, strict=True)]
     return [run for run in runs if run.row["condition"] == rows[0]["condition"]]
+
+
+def _name_condition(figure: Figure, runs: Sequence[_Run]) -> None:
+    """Head a figure with the condition of its episodes, unless that is the nominal one."""
+    condition = runs[0].row["condition"]
+    if condition != "nominal":
+        figure.suptitle(f"condition {condition}")
 
 
 def _names(runs: Sequence[_Run], column: str) -> list[str]:
@@ -167,6 +174,7 @@ def gait_shares(folder: Path, out: Path) -> None:
     axes[0, 0].invert_yaxis()
     patches = [Patch(color=colour) for colour in GAIT_COLOURS]
     figure.legend(patches, GAITS, loc="outside right center")
+    _name_condition(figure, runs)
     _save(figure, out)
 
 
@@ -217,6 +225,7 @@ def headings(folder: Path, out: Path) -> None:
             axis.yaxis.set_major_locator(MaxNLocator(3, integer=True))
             axis.set_rlabel_position(135)
             axis.set_title(f"{policy}, {family}", fontsize=9)
+    _name_condition(figure, runs)
     _caption(
         figure,
         "Heading of the body against its direction of travel (up); radius: share of that time (%)",
@@ -265,6 +274,7 @@ def trajectories(folder: Path, out: Path) -> None:
     for axis in axes[-1]:
         axis.set_xlabel("x (m)")
     axes[0, 0].set(xlim=(0, TILE_SIZE), ylim=(0, TILE_SIZE))
+    _name_condition(figure, runs)
     _caption(
         figure,
         "Arrows: heading of the body, once a second. Cross: end of an episode that did not reach "
@@ -411,7 +421,7 @@ def decision_curve(log: Path, out: Path) -> None:
 
 def ablation(table: Path, out: Path) -> None:
     """Success with 95 % intervals of each variant (ablation.json), and of each seed as a dot. A
-    line is at that of the first, with which the others are compared."""
+    line is at that of ``full``, with which the others are compared, if it is there."""
     every: list[dict[str, Any]] = json.loads(table.read_text(encoding="utf-8"))["rows"]
     rows = [row for row in every if "n" in row]
     height = 1.0 + 0.3 * max(len(rows), 1)
@@ -422,8 +432,8 @@ def ablation(table: Path, out: Path) -> None:
         axis.barh(y, rate, xerr=ends, capsize=2, color=POLICY_COLOURS["tdgc"], alpha=0.6)
         if len(row["seeds"]) > 1:
             axis.plot([100 * r for r in row["seeds"].values()], [y] * len(row["seeds"]), "k.")
-    if rows:
-        axis.axvline(100 * rows[0]["rate"], color="0.5", linestyle=":")
+        if row["name"] == "full":
+            axis.axvline(rate, color="0.5", linestyle=":")
     axis.set_yticks(range(len(rows)), [f"{row['name']}: {row['what']}" for row in rows], fontsize=8)
     axis.invert_yaxis()
     axis.set(xlabel="success (%)", xlim=(0, 100))

@@ -1,11 +1,13 @@
-"""Cells: a variant with a seed, trained by train_high.py and evaluated by evaluate.py.
+"""Trials: a variant with a seed, trained by train_high.py and evaluated by evaluate.py.
 
-A cell has a folder: the run of its training, ``evaluation`` with the results of evaluate.py, and
-``cell.json`` once it is done. Until then a cell that is run again goes on where it was.
+A trial has a folder: the run of its training, ``evaluation`` with the results of evaluate.py, and
+``cell.json`` once it is done. Until then a trial that is run again goes on where it was.
 """
 
 import contextlib
+import csv
 import io
+import itertools
 import json
 import shutil
 import signal
@@ -16,26 +18,36 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 import evaluate
 import train_high
 from tdgc import policies
 from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
+from tdgc.errors import InputError
 from tdgc.files import atomic
 from tdgc.parallel.cores import Workers
 from tdgc.tasks.high_env import load_low
+from tdgc.tasks.rules import OUTCOMES
+
+#: Family, level and number of a tile.
+Tile = tuple[str, int, int]
+#: What is kept of a training: decisions, s, and h of all robots together.
+FACTS = ("steps", "train_seconds", "simulated_hours")
 
 
-class CellError(Exception):
-    """A cell that cannot be trained or evaluated; the message is one line."""
+class TrialError(InputError):
+    """A trial that cannot be trained or evaluated; the message is one line."""
 
 
 class StoppedError(Exception):
-    """A signal or the time limit came before a cell was done."""
+    """A signal or the time limit came before a trial was done."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class Trial:
     """A variant with the seed of its training; None where no training is in it."""
 
     variant: Variant
@@ -43,13 +55,26 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of the cell and of its folder."""
+        """Of the trial and of its folder."""
         return self.variant.name if self.seed is None else f"{self.variant.name}-{self.seed}"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a trial came to.
+
+    Attributes:
+        facts: ``FACTS`` of its training; empty without one.
+        reached: (n,) whether the goal was reached, in the order of ``Runner.tiles``.
+    """
+
+    facts: dict[str, float]
+    reached: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Runner:
-    """Runs cells that can be compared.
+    """Runs trials that can be compared.
 
     Attributes:
         out: where their folders are.
@@ -73,43 +98,63 @@ class Runner:
     workers: Workers
     deadline: float | None
 
-    def run(self, cell: Cell) -> dict[str, Any]:
-        """Train a cell, if need be, and evaluate it, from where an earlier call was.
-
-        Returns:
-            ``evaluate_seconds``, and of a training ``steps``, ``train_seconds`` and
-            ``simulated_hours``, those of all robots together.
+    def run(self, trial: Trial) -> Result:
+        """Train a trial, if need be, and evaluate it, from where an earlier call was.
 
         Raises:
-            CellError, StoppedError: it is not done.
+            TrialError: it cannot be done, or a file of it is damaged.
+            StoppedError: it is not done yet.
         """
-        folder = self.out / cell.name
-        if (folder / "cell.json").is_file():
-            found: dict[str, Any] = read_json(folder / "cell.json")
-            return found
+        folder = self.out / trial.name
+        try:
+            if not (folder / "cell.json").is_file():
+                self._complete(trial, folder)
+            facts = read_json(folder / "cell.json")
+            kept = FACTS if trial.variant.settings is not None else ()
+            return Result(
+                {name: _number(facts, name, folder / "cell.json") for name in kept},
+                _reached(folder / "evaluation" / "episodes.csv", self.tiles()),
+            )
+        except StoppedError:
+            raise
+        except (InputError, OSError) as error:  # they say which file
+            raise TrialError(str(error)) from error
+        except Exception as error:  # whatever it is, the other trials go on
+            said = " ".join(str(error).split())
+            raise TrialError(f"{type(error).__name__}: {said}") from error
+
+    def _complete(self, trial: Trial, folder: Path) -> None:
+        """Do what is left of a trial; in the end it has its ``cell.json``."""
         high = None
-        if cell.variant.settings is not None:
-            self._train(cell, folder)
+        if trial.variant.settings is not None:
+            self._train(trial, folder)
             high = folder / "policy"
-        elif cell.variant.policy == "tdgc":
-            high = self.out / f"{WHOLE}-{cell.seed}" / "policy"
-            if not (self.out / f"{WHOLE}-{cell.seed}" / "cell.json").is_file():
-                raise CellError(f"it needs '{WHOLE}' with seed {cell.seed}, which is not done")
+        elif trial.variant.policy == "tdgc":
+            whole = self.out / f"{WHOLE}-{trial.seed}"
+            high = whole / "policy"
+            if not (whole / "cell.json").is_file():
+                raise TrialError(f"it needs '{WHOLE}' with seed {trial.seed}, which is not done")
         self._seconds_left()
         began = time.monotonic()
         folder.mkdir(parents=True, exist_ok=True)
-        try:
-            low, high = changed_pair(cell.variant, self.low, high, folder)
-        except (ValueError, OSError) as error:
-            raise CellError(str(error)) from error
-        flags = self.evaluation_flags(cell.variant.policy, low, high)
+        low, high = changed_pair(trial.variant, self.low, high, folder)
+        flags = self.evaluation_flags(trial.variant.policy, low, high)
         call(evaluate.main, [*flags, "--out", folder / "evaluation"])
         found = {"evaluate_seconds": round(time.monotonic() - began, 1)}
-        if cell.variant.settings is not None:
-            found |= _training_facts(folder, low)
+        if trial.variant.settings is not None:
+            found |= _training_facts(folder / "policy", low)
         with atomic(folder / "cell.json") as partial:
             partial.write_text(json.dumps(found, indent=2), encoding="utf-8")
-        return found
+
+    def tiles(self) -> list[Tile]:
+        """All tiles that each trial is evaluated on.
+
+        Raises:
+            ValueError, OSError: flags that evaluate.py cannot use.
+        """
+        flags = self.evaluation_flags("gp", self.low, None)
+        e = evaluate.Evaluation.of(evaluate.parse([str(flag) for flag in flags]))
+        return list(itertools.product(e.families, e.levels, range(e.episodes)))
 
     def training_settings(self, variant: Variant) -> tuple[str, ...]:
         """What ``--set`` is given in a variant's training."""
@@ -126,24 +171,25 @@ class Runner:
         ]
         return flags if high is None else [*flags, "--high", high]
 
-    def _train(self, cell: Cell, folder: Path) -> None:
+    def _train(self, trial: Trial, folder: Path) -> None:
         """Train to the end of the budget."""
         flags: list[object] = []
         if any((folder / "checkpoints").glob("step-*")):
             flags += ["--resume"]
         else:
             shutil.rmtree(folder, ignore_errors=True)  # killed before its first checkpoint
-            flags += ["--low", self.low, "--seed", cell.seed, "--workers", self.workers]
+            flags += ["--low", self.low, "--seed", trial.seed, "--workers", self.workers]
             flags += [] if self.steps is None else ["--steps", self.steps]
             flags += ["--no-teacher"] if self.alone else []
-            for setting in self.training_settings(cell.variant):
+            for setting in self.training_settings(trial.variant):
                 flags += ["--set", setting]
         left = self._seconds_left()
         flags += [] if left is None else ["--time-limit", left]
         with _own_signals():
             call(train_high.main, [*flags, "--out", folder])
-        budget = read_json(folder / "config.json")["steps"]
-        if policies.load(folder / "policy").meta["steps"] < budget:
+        budget = _number(read_json(folder / "config.json"), "steps", folder / "config.json")
+        meta = policies.load(folder / "policy").meta
+        if _number(meta, "steps", folder / "policy.json") < budget:
             raise StoppedError
 
     def _seconds_left(self) -> float | None:
@@ -177,19 +223,16 @@ def call(main: Callable[[list[str]], int], flags: Sequence[object]) -> None:
     """Call a script's ``main``.
 
     Raises:
-        CellError: it failed; with what it said.
+        TrialError: it failed; with what it said.
     """
     said = _Tee(sys.stderr)
-    try:
-        with contextlib.redirect_stderr(said):
-            status = main([str(flag) for flag in flags])
-    except Exception as error:  # whatever it is, the other cells go on
-        raise CellError(f"{type(error).__name__}: {' '.join(str(error).split())}") from error
+    with contextlib.redirect_stderr(said):
+        status = main([str(flag) for flag in flags])
     if status:
         script = f"{main.__module__}.py: "
         lines = said.getvalue().replace("\r", "\n").splitlines()
         named = [line.removeprefix(script) for line in lines if line.startswith(script)]
-        raise CellError(named[-1] if named else f"{script}status {status}")
+        raise TrialError(named[-1] if named else f"{script}status {status}")
 
 
 @contextlib.contextmanager
@@ -242,11 +285,50 @@ def _changed(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _training_facts(folder: Path, low: Path) -> dict[str, Any]:
-    meta = policies.load(folder / "policy").meta
-    decision = meta["config"]["decimation"] * load_low(low)[1].physics.control_dt  # s
+# ---------------------------------------------------------------------------- files of a trial
+
+
+def _number(table: Any, key: str, path: Path) -> float:
+    """An entry of the table in the file ``path``.
+
+    Raises:
+        TrialError: it has none, or one that is no number.
+    """
+    value = table.get(key) if isinstance(table, dict) else None
+    if not isinstance(value, int | float):
+        raise TrialError(f"{path}: '{key}' must be a number, not {value!r}")
+    return value
+
+
+def _training_facts(policy: Path, low: Path) -> dict[str, float]:
+    meta, path = policies.load(policy).meta, policy.with_suffix(".json")
+    decimation = _number(meta.get("config"), "decimation", path)
+    hours = decimation * load_low(low)[1].physics.control_dt / 3600.0  # of a decision
+    steps = _number(meta, "steps", path)
     return {
-        "steps": meta["steps"],
-        "train_seconds": meta["seconds"],
-        "simulated_hours": round(meta["steps"] * decision / 3600.0, 2),
+        "steps": steps,
+        "train_seconds": _number(meta, "seconds", path),
+        "simulated_hours": round(steps * hours, 2),
     }
+
+
+def _reached(path: Path, tiles: Sequence[Tile]) -> NDArray[np.bool_]:
+    """Whether the goal was reached on each tile, by the episodes.csv of an evaluation.
+
+    Raises:
+        TrialError: one that cannot be read, or that lacks a tile.
+        OSError: it is missing.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            outcomes = {
+                (row["family"], int(row["level"]), int(row["episode"])): row["outcome"]
+                for row in csv.DictReader(file)
+            }
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise TrialError(f"{path}: damaged, or not of an evaluation") from error
+    for tile in tiles:
+        if outcomes.get(tile) not in OUTCOMES:
+            family, level, number = tile
+            raise TrialError(f"{path}: no outcome of episode {number} on {family}, level {level}")
+    return np.array([outcomes[tile] == "reached" for tile in tiles])
