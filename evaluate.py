@@ -43,8 +43,8 @@ from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.terrain import ALL_FAMILIES
 from tdgc.sim.world import WindowError
-from tdgc.tasks.high_env import PRETRAINED, load_low
 from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.teacher import STYLES
 
 POLICIES = ("tdgc", "gp")

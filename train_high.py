@@ -37,16 +37,11 @@ from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EDITION
 from tdgc.sim.world import check_robot
 from tdgc.tasks.curriculum import check_rules
-from tdgc.tasks.high_env import (
-    PRETRAINED,
-    NavigationTask,
-    high_mirror,
-    high_spaces,
-    load_low,
-    paired,
-    summarise,
-)
+from tdgc.tasks.high_env import NavigationTask
+from tdgc.tasks.high_observation import high_mirror, high_spaces
+from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.teacher import STYLES
 from tdgc.tasks.tiles import check_families, check_levels
 

@@ -45,7 +45,7 @@ from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS
-from tdgc.tasks.high_env import high_spaces
+from tdgc.tasks.high_observation import high_spaces
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 

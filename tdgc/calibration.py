@@ -35,8 +35,8 @@ from tdgc.sim.commands import CONTINUOUS, NAMES, NUM_COMMANDS, SIDEWAYS, observe
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, action_scale
-from tdgc.tasks.high_env import load_low
 from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import is_fallen
 
 #: From the commands asked for to those given, (n, 15) -> (n, 15).

@@ -40,7 +40,8 @@ from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
 from tdgc.sim.terrain import TileField, make_tile
 from tdgc.sim.world import World
-from tdgc.tasks.high_env import PRETRAINED, SEMANTIC, load_low
+from tdgc.tasks.high_observation import SEMANTIC
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.rules import GOAL_RADIUS, GOING, outcome
 

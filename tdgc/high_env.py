@@ -1,3 +1,3 @@
-from tdgc.tasks.high_env import load_low
+from tdgc.tasks.pairing import load_low
 
 __all__ = ["load_low"]

@@ -21,7 +21,9 @@ from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, LowLevelCo
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.learn.run import Interruption
 from tdgc.sim.commands import NUM_ACTIONS
-from tdgc.tasks.high_env import PRETRAINED, NavigationTask, high_mirror, paired
+from tdgc.tasks.high_env import NavigationTask
+from tdgc.tasks.high_observation import high_mirror
+from tdgc.tasks.pairing import PRETRAINED, paired
 
 ROOT = Path(__file__).resolve().parents[1]
 LOW = PRETRAINED / "low"

@@ -15,8 +15,8 @@ from tdgc.config import HighLevelConfig
 from tdgc.sim.commands import INDEX
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, START_X
-from tdgc.tasks.high_env import PRETRAINED, load_low
 from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES
 
 LOW, CONFIG = load_low(PRETRAINED / "low")

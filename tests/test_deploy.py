@@ -19,7 +19,7 @@ from tdgc.deploy.interface import SCHEMA, ExportError, checksum, read_interface
 from tdgc.deploy.log import LogError, LogWriter
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import RobotState
-from tdgc.tasks.high_env import PRETRAINED
+from tdgc.tasks.pairing import PRETRAINED
 
 FORM = "torchscript"  # written in a tenth of the time
 

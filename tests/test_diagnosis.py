@@ -26,7 +26,7 @@ from tdgc.benchmark.trace import COLUMNS, Trace, Tracer
 from tdgc.sim.commands import INDEX
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import NUM_PROBES
 
 HIPS = 0.183  # m, of the shipped robot

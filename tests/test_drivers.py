@@ -36,16 +36,10 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import Array
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.high_env import (
-    GUIDANCE,
-    PRETRAINED,
-    SEMANTIC,
-    NavigationTask,
-    Seen,
-    high_layout,
-    load_low,
-)
+from tdgc.tasks.high_env import NavigationTask
+from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, Seen, high_layout
 from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 
 LOW = PRETRAINED / "low"

@@ -38,7 +38,7 @@ from tdgc.parallel.worker import WorkerError
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.rules import OUTCOMES
 
 

@@ -12,7 +12,7 @@ from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.sensors import EpisodeDraws, Noise
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 LOW, CONFIG = load_low(PRETRAINED / "low")
 

@@ -30,8 +30,10 @@ from tdgc.sim.geometry import urdf_path
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import JOINTS, nominal_pose
-from tdgc.tasks.high_env import PRETRAINED, NavigationTask, Seen, high_layout, high_mirror, load_low
+from tdgc.tasks.high_env import NavigationTask
+from tdgc.tasks.high_observation import Seen, high_layout, high_mirror
 from tdgc.tasks.low_observation import low_mirror
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 
 LOW = PRETRAINED / "low"

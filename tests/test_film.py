@@ -26,7 +26,7 @@ from tdgc.sim.gaits import gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, nominal_pose
 from tdgc.sim.terrain import TileField
-from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.rewards import CONTACT_FORCE
 
 

@@ -50,7 +50,7 @@ from tdgc.errors import InputError
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import configure
 from tdgc.policies import AsymmetricActorCriticPolicy, Header, PolicyFileError
-from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 #: The same examples in every run.
 examples = settings(deadline=None, derandomize=True, database=None, max_examples=60)

@@ -29,8 +29,8 @@ from tdgc.sim.robot import (
 )
 from tdgc.sim.world import World
 from tdgc.tasks import rewards
-from tdgc.tasks.high_env import PRETRAINED
 from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.pairing import PRETRAINED
 
 SHIPPED = urdf_path(RobotConfig()).read_text(encoding="utf-8")
 STILL, UPRIGHT = np.zeros((1, 12)), np.array([[0.0, 0.0, 0.0, 1.0]])

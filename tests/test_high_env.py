@@ -27,17 +27,10 @@ from tdgc.sim.robot import nominal_pose
 from tdgc.sim.terrain import TILE_SIZE, make_tile
 from tdgc.tasks import rewards
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.high_env import (
-    GUIDANCE,
-    PRETRAINED,
-    SEMANTIC,
-    NavigationTask,
-    high_layout,
-    high_mirror,
-    load_low,
-    paired,
-)
+from tdgc.tasks.high_env import NavigationTask
+from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, high_layout, high_mirror
 from tdgc.tasks.leaps import Landing
+from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rewards import HighStep
 

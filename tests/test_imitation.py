@@ -19,7 +19,7 @@ from tdgc.learn.imitation import (
 )
 from tdgc.learn.recurrent import FastRecurrentPPO
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
-from tdgc.tasks.high_env import GUIDANCE
+from tdgc.tasks.high_observation import GUIDANCE
 from tdgc.tasks.leaps import FREQUENCIES
 
 SEEN, ENVS, STEPS = 5, 4, 16

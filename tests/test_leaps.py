@@ -6,7 +6,6 @@ import pytest
 from tdgc.config import CommandRanges
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import make_tile
-from tdgc.tasks.high_env import PRETRAINED, load_low
 from tdgc.tasks.leaps import (
     FREQUENCIES,
     SPEED,
@@ -20,6 +19,7 @@ from tdgc.tasks.leaps import (
     measure_landing,
     speed_up,
 )
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 LOW = PRETRAINED / "low"
 RANGES = CommandRanges()

@@ -29,7 +29,7 @@ from tdgc.parallel.worker import WorkerError
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import nominal_height, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import TileField
-from tdgc.tasks.high_env import PRETRAINED
+from tdgc.tasks.pairing import PRETRAINED
 
 ROBOT = RobotConfig()
 WEIGHT = 12.6 * 9.81

@@ -11,7 +11,7 @@ import pytest
 from tdgc import policies
 from tdgc.config import HighLevelConfig, HighTrainConfig, LowTrainConfig, recorded, to_dict
 from tdgc.sim.terrain import EDITION
-from tdgc.tasks.high_env import PRETRAINED, load_low, paired
+from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 
 
 def read(path: Path) -> Any:

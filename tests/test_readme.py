@@ -26,7 +26,7 @@ from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.terrain import ALL_FAMILIES, PARAMETER_RANGES
-from tdgc.tasks.high_env import high_layout
+from tdgc.tasks.high_observation import high_layout
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

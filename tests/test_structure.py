@@ -36,7 +36,7 @@ DOORS = {
     "terrain": ("sim.terrain", {"make_tile"}),
     "commands": ("sim.commands", {"CommandDecoder"}),
     "gaits": ("sim.gaits", {"GAITS", "PhaseClock"}),
-    "high_env": ("tasks.high_env", {"load_low"}),
+    "high_env": ("tasks.pairing", {"load_low"}),
     "drivers": ("benchmark.drivers", {"BaselineDriver", "HierarchyDriver", "load_high"}),
     "evaluation": ("benchmark.evaluation", {"Cell", "run_cell"}),
 }

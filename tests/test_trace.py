@@ -26,7 +26,7 @@ from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
-from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 
 ROOT = Path(__file__).resolve().parents[1]

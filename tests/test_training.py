@@ -43,8 +43,8 @@ from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
-from tdgc.tasks.high_env import PRETRAINED
 from tdgc.tasks.low_observation import low_mirror, low_spaces
+from tdgc.tasks.pairing import PRETRAINED
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -32,7 +32,7 @@ from tdgc.sim.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 LOW = LowLevelConfig()
 HIGH = HighLevelConfig(commands=LOW.commands)

@@ -28,7 +28,7 @@ from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
 from tdgc.parallel.cores import workers_flag
 from tdgc.show import plots
-from tdgc.tasks.high_env import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:

@@ -29,7 +29,7 @@ from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
 from tdgc.files import atomic
 from tdgc.parallel.cores import Workers
-from tdgc.tasks.high_env import load_low
+from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import OUTCOMES
 
 #: Family, level and number of a tile.

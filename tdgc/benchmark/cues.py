@@ -15,7 +15,7 @@ from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, ZONE
-from tdgc.tasks.high_env import GOAL_SCALE, SEMANTIC, high_layout
+from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
 from tdgc.tasks.leaps import BEYOND, SPEED, Landing, LeapPlan, Motion, leap_command, steer_leap
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.teacher import STYLES, Style, toward

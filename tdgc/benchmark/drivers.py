@@ -24,8 +24,9 @@ from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.tasks.approach import Approach
-from tdgc.tasks.high_env import SEMANTIC, Seen, high_layout, paired
+from tdgc.tasks.high_observation import SEMANTIC, Seen, high_layout
 from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.pairing import paired
 from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.teacher import Teacher, toward
 

@@ -35,7 +35,7 @@ from tdgc.sim.terrain import (
 )
 from tdgc.sim.world import World
 from tdgc.tasks.executor import Carries, Executor
-from tdgc.tasks.high_env import load_low
+from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import GOING, HORIZON, OUTCOMES, outcome
 
 BATCH = 50  # episodes a world: enough to keep numpy busy, few enough to share out evenly

@@ -40,7 +40,7 @@ from tdgc.sim.robot import (
     nominal_pose,
     target_limits,
 )
-from tdgc.tasks.high_env import GOAL_SCALE, SEMANTIC, high_layout
+from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
 from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE
 
 

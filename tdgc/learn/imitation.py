@@ -18,7 +18,7 @@ from torch import nn
 
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
-from tdgc.tasks.high_env import GUIDANCE
+from tdgc.tasks.high_observation import GUIDANCE
 from tdgc.tasks.leaps import FREQUENCIES
 
 _FREQUENCY = INDEX["frequency"]

@@ -4,158 +4,37 @@
 curriculum sets; ``NavigationEnv`` is its Gymnasium face for one.
 """
 
-import dataclasses
 import functools
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc import policies
-from tdgc.config import (
-    CommandRanges,
-    ConfigError,
-    HighLevelConfig,
-    HighRewardConfig,
-    LowLevelConfig,
-    recorded,
-)
-from tdgc.policies import Mirror, Policy
-from tdgc.sim.commands import (
-    CONTINUOUS,
-    INDEX,
-    NUM_ACTIONS,
-    SIDEWAYS,
-    CommandDecoder,
-    default_command,
-    gait_index,
-)
+from tdgc.config import HighLevelConfig, HighRewardConfig
+from tdgc.policies import Policy
+from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, gait_index
 from tdgc.sim.gaits import GAITS
-from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
-from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, in_place, mirror, observe, width
-from tdgc.sim.robot import NUM_JOINTS, Array, wrap_angle
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.observation import observe
+from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import FAMILIES, draw_start_goal
+from tdgc.sim.terrain import draw_start_goal
 from tdgc.state import State, copies, fill
 from tdgc.tasks import rewards
 from tdgc.tasks.approach import Approach
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.leaps import FREQUENCIES, Landing
-from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP, PROBES, HeightProbes
+from tdgc.tasks.high_observation import SEMANTIC, Seen, high_layout, high_spaces
+from tdgc.tasks.leaps import Landing
+from tdgc.tasks.pairing import PRETRAINED, load_low, paired
+from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, has_failed, outcome
+from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.teacher import Teacher
 from tdgc.tasks.tiles import TrainingTiles, shallow
-
-#: Where the shipped policies are.
-PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
-
-GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
-#: Width of what a teacher adds to an observation.
-GUIDANCE = NUM_ACTIONS + FREQUENCIES
-
-#: The semantic cue: one-hot over the families, and one place for "unknown".
-SEMANTIC = (*FAMILIES, "unknown")
-
-
-class Seen(NamedTuple):
-    """What o^H of M robots is read from.
-
-    Attributes:
-        loco: the robots.
-        goal: (M, 2) m in the world.
-        time_share: (M,) t / T_max.
-        last_action: (M, 13), normalised.
-        families: (M,) index into ``SEMANTIC``.
-        probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
-        late: (M,) how many decisions ago those were measured.
-        closing: (M,) m/s, how fast the goal came nearer since the last decision.
-    """
-
-    loco: Locomotion
-    goal: Array
-    time_share: Array
-    last_action: Array
-    families: NDArray[np.int64]
-    probes: Array
-    late: NDArray[Any]
-    closing: Array
-
-
-def _goal(seen: Seen) -> Array:
-    state = seen.loco.world.state
-    offset = seen.goal - state.position[:, :2]
-    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
-    distance = np.linalg.norm(offset, axis=1)
-    return np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1)
-
-
-def _joint_error(seen: Seen) -> Array:
-    return seen.loco.world.state.q - seen.loco.joint_offset - seen.loco.nominal
-
-
-_FLIP_ACTION = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in (*CONTINUOUS, "gait")))
-_LAYOUT: tuple[Term[Seen], ...] = (
-    Term("goal", 3, _goal, mirror=in_place(1.0, 1.0, -1.0)),
-    Term("time_left", 1, lambda s: 1.0 - s.time_share[:, None]),
-    Term("gravity", 3, lambda s: s.loco.world.state.gravity, mirror=ARROW),
-    Term("joint_error", 12, _joint_error, mirror=JOINTS),
-    Term("joint_speed", 12, lambda s: s.loco.world.state.qd, SPEED_SCALE, mirror=JOINTS),
-    Term("last_action", 13, lambda s: s.last_action, mirror=_FLIP_ACTION),
-    Term("clock", 4, lambda s: s.loco.clock.signal(), mirror=LEGS),
-)
-_COSINE: Term[Seen] = Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), mirror=LEGS)
-_PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
-_AGE: Term[Seen] = Term("probe_age", 1, lambda s: s.late[:, None].astype(np.float64))
-_CLOSING: Term[Seen] = Term("closing_speed", 1, lambda s: s.closing[:, None])
-_CUES: dict[str, Term[Seen]] = {
-    "semantic": Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
-    "geometric": Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
-}
-
-
-def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
-    """The terms of the high policy's observation o^H, in order."""
-    clock = (_COSINE,) if config.clock == "both" else ()
-    cues = [term for cue, term in _CUES.items() if config.cues in ("both", cue)]
-    age = (_AGE,) if config.probe_age and config.cues in ("both", "geometric") else ()
-    closing = (_CLOSING,) if config.closing_speed else ()
-    return (*_LAYOUT, *clock, *cues, *age, *closing)
-
-
-def high_spaces(
-    config: HighLevelConfig, taught: bool = False
-) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """Observations, with the teacher's guidance if there is one, and actions of the high policy."""
-    size = width(high_layout(config)) + taught * GUIDANCE
-    limit = config.action_limit
-    seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-    return seen, gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
-
-
-def high_mirror(config: HighLevelConfig) -> Mirror:
-    """Left-right mirror of the high policy's observations and actions.
-
-    Raises:
-        ConfigError: probes or bounds to one side that are not those to the other.
-    """
-    if config.probes != "lines":
-        raise ConfigError(
-            f"probes that are {config.probes} are not the same on both sides, as a symmetric "
-            "policy needs them; ppo.mirror=false does without symmetry"
-        )
-    for name in SIDEWAYS:
-        low, high = getattr(config.commands or CommandRanges(), name)
-        if low != -high:
-            raise ConfigError(
-                f"commands.{name} must be the same to both sides for a symmetric policy, not "
-                f"{[low, high]}; ppo.mirror=false does without symmetry"
-            )
-    return Mirror(*mirror(high_layout(config)), *_FLIP_ACTION)
 
 
 def command_share(commands: Array, decoder: CommandDecoder) -> Array:
@@ -201,53 +80,6 @@ def high_step(
         contact_forces=force,
         config=config,
     )
-
-
-#: What a high policy decides, beside the gait, when its ``behaviour`` is "velocities".
-VELOCITIES = ("vx", "vy", "yaw_rate")
-
-
-def at_default(ranges: CommandRanges) -> CommandRanges:
-    """Bounds that leave only the velocities free: the others at their defaults, or at the bound
-    next to it."""
-    default, pinned = default_command(), {}
-    for name in CONTINUOUS:
-        if name not in VELOCITIES:
-            value = float(np.clip(default[INDEX[name]], *getattr(ranges, name)))
-            pinned[name] = value, value
-    return dataclasses.replace(ranges, **pinned)
-
-
-def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
-    """The MDP of a high policy on a low policy: with the decoder's bounds, the low policy's if it
-    has none.
-
-    Raises:
-        ConfigError: bounds that the low policy was not trained on; names the command and both.
-    """
-    ranges = high.commands or low.commands
-    if high.behaviour == "velocities":
-        ranges = at_default(ranges)
-    for f in dataclasses.fields(low.commands):
-        asked, trained = getattr(ranges, f.name), getattr(low.commands, f.name)
-        if asked[0] < trained[0] or asked[1] > trained[1]:
-            raise ConfigError(
-                f"commands.{f.name} asks for {list(asked)}, but the low policy was trained on "
-                f"{list(trained)}"
-            )
-    return dataclasses.replace(high, commands=ranges)
-
-
-def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
-    """A low policy, given itself or by its path, and the MDP it was trained on.
-
-    Raises:
-        ValueError: a file that cannot be used, or a policy that is no low policy.
-    """
-    name, low = low, low if isinstance(low, Policy) else policies.load(low)
-    if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
-        raise ConfigError(f"{name}: not a low policy of this package")
-    return low, recorded(LowLevelConfig, low.meta["config"], name)
 
 
 class NavigationTask:
@@ -303,7 +135,8 @@ class NavigationTask:
         alter = None
         if training and config.shallowest_trench is not None:
             alter = functools.partial(shallow, shallowest=config.shallowest_trench)
-        self.tiles = TrainingTiles([config.families[f] for f in self.family], seed, alter)
+        self._families = [config.families[f] for f in self.family]
+        self.tiles = TrainingTiles(self._families, seed, alter)
         self.field = self.tiles.field
         self._build_robots()
         self._origin = self.field.origin(np.arange(m), 0)
@@ -315,11 +148,12 @@ class NavigationTask:
         self._pushes = Pushes(*disturbed, self._next_push)
         self._actions = np.zeros((2, m, NUM_ACTIONS))
         self._commands = np.zeros((3, m, 15))
-        self.stats: dict[str, float] = {}
-        families = [config.families[f] for f in self.family]
-        ranges = config.commands or CommandRanges()
-        told = self.family_index != SEMANTIC.index("unknown")
-        self.teacher = Teacher(self.field, families, ranges, landing, told) if taught else None
+        self.stats = Sums()
+        self.teacher = None
+        if taught:
+            told = self.family_index != SEMANTIC.index("unknown")
+            assert config.commands is not None  # ``paired`` has set them
+            self.teacher = Teacher(self.field, self._families, config.commands, landing, told)
         self._lead, self._decisions = led, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
@@ -409,9 +243,8 @@ class NavigationTask:
         if self.teacher is not None:
             self.teacher.watch(loco, self.step_seconds)
         self.elapsed += 1
-        self._reached_at[reached & (self._reached_at < 0)] = self.elapsed[
-            reached & (self._reached_at < 0)
-        ]
+        first = reached & (self._reached_at < 0)
+        self._reached_at[first] = self.elapsed[first]
         seen = high_step(
             loco,
             self.goal,
@@ -464,12 +297,12 @@ class NavigationTask:
     @property
     def family_index(self) -> NDArray[np.int64]:
         """Index into ``SEMANTIC`` of the family that each robot is told, (M,)."""
-        names = [self.config.families[f] for f in self.family]
-        told = np.array([SEMANTIC.index(n) if n in SEMANTIC else len(FAMILIES) for n in names])
+        unknown = SEMANTIC.index("unknown")
+        told = np.array([SEMANTIC.index(n) if n in SEMANTIC else unknown for n in self._families])
         if self.training:  # the last robots of each family are not told
             each = self.num_robots / len(self.config.families)
             place = np.arange(self.num_robots) // len(self.config.families)
-            told[place >= each * (1.0 - self.config.unknown_share)] = len(FAMILIES)
+            told[place >= each * (1.0 - self.config.unknown_share)] = unknown
         return told
 
     # ------------------------------------------------------------------ statistics, resume
@@ -482,15 +315,8 @@ class NavigationTask:
         done: NDArray[np.integer],
         reached: NDArray[np.bool_],
     ) -> None:
-        stats = self.stats
-
-        def add(key: str, value: float) -> None:
-            stats[key] = stats.get(key, 0.0) + float(value)
-
-        add("steps", self.num_robots)
-        add("reward", reward.sum())
-        for name, value in terms.items():
-            add(f"term/{name}", value.sum())
+        add = self.stats.add
+        self.stats.add_rewards(terms, reward)
         gait = gait_index(commands)
         for col, family in enumerate(self.config.families):
             mine = self.family == col
@@ -504,7 +330,7 @@ class NavigationTask:
 
     def take_stats(self) -> dict[str, float]:
         """The sums since the last call."""
-        stats, self.stats = self.stats, {}
+        stats, self.stats = self.stats, Sums()
         stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
         return stats
 
@@ -602,23 +428,3 @@ class NavigationEnv(TaskEnv):
             lambda seed, visual: NavigationTask(self.config, low, 1, seed, visual=visual),
             render_mode,
         )
-
-
-def summarise(sums: dict[str, float]) -> dict[str, float]:
-    """Sums of ``NavigationTask.take_stats`` over all workers -> values to log."""
-    steps = max(sums.get("steps", 0.0), 1.0)
-    values = {"reward/total": sums.get("reward", 0.0) / steps}
-    for key, value in sums.items():
-        if key.startswith("term/"):
-            values[f"reward/{key[5:]}"] = value / steps
-    counts = [k for k in sums if k.startswith("family/") and k.endswith("/count")]
-    families = [k.removeprefix("family/").removesuffix("/count") for k in counts]
-    for family in families:
-        count = max(sums[f"family/{family}/count"], 1.0)
-        values[f"level/{family}"] = sums[f"family/{family}/level"] / count
-        episodes = sums[f"family/{family}/episodes"]
-        if episodes:
-            values[f"success/{family}"] = sums[f"family/{family}/reached"] / episodes
-        for gait in GAITS:
-            values[f"gait/{family}_{gait}"] = sums[f"family/{family}/{gait}"] / count
-    return values

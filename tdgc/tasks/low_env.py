@@ -28,9 +28,10 @@ from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, Seen, low_spaces
-from tdgc.tasks.low_statistics import Sums, by_gait
+from tdgc.tasks.low_statistics import by_gait
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import is_fallen
+from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.tiles import FLAT, TrainingTiles, shallow
 
@@ -266,12 +267,9 @@ class LowLevelTask:
     def _count(self, terms: dict[str, Array], reward: Array, terminated: NDArray[np.bool_]) -> None:
         """Add this step to ``stats`` (``tdgc.learn.run`` divides and logs them)."""
         add = self.stats.add
-        add("steps", self.num_robots)
+        self.stats.add_rewards(terms, reward)
         add("minutes", self.num_robots * self.config.physics.control_dt / 60.0)
         add("falls", terminated.sum())
-        add("reward", reward.sum())
-        for name, value in terms.items():
-            add(f"term/{name}", value.sum())
         sums = by_gait(self.locomotion, terms)
         for key in ("steps", "lin", "yaw", "match"):
             for gait, value in zip(GAITS, sums[key], strict=True):

@@ -9,14 +9,7 @@ from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.tasks.rewards import CONTACT_FORCE
-
-
-class Sums(dict[str, float]):
-    """Numbers that are added up by name."""
-
-    def add(self, name: str, value: float) -> None:
-        """Add to one of them, which begins at 0."""
-        self[name] = self.get(name, 0.0) + float(value)
+from tdgc.tasks.statistics import mean_rewards
 
 
 def by_gait(loco: Locomotion, terms: Mapping[str, Array]) -> dict[str, Array]:
@@ -42,14 +35,11 @@ def by_gait(loco: Locomotion, terms: Mapping[str, Array]) -> dict[str, Array]:
 
 def summarise(sums: Mapping[str, float]) -> dict[str, float]:
     """Sums of ``LowLevelTask.take_stats`` over all workers -> values to log."""
-    steps = max(sums.get("steps", 0.0), 1.0)
-    values = {"reward/total": sums.get("reward", 0.0) / steps}
+    values = mean_rewards(sums)
     values["falls_per_minute"] = sums.get("falls", 0.0) / (sums.get("minutes", 0.0) or 1.0)
     for key, value in sums.items():
         kind, _, name = key.partition("/")
-        if kind == "term":
-            values[f"reward/{name}"] = value / steps
-        elif kind == "share":
+        if kind == "share":
             values[f"command_share/{name}"] = value / sums["robots"]
         elif kind == "landing":
             values[key] = value / sums["leapers"]

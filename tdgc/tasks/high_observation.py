@@ -1,0 +1,121 @@
+"""What the high policy sees, o^H (paper Sec. IV-B): a table of terms, from which sizes and mirrors
+follow."""
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig
+from tdgc.policies import Mirror
+from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS
+from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
+from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, in_place, mirror, width
+from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.terrain import FAMILIES
+from tdgc.tasks.leaps import FREQUENCIES
+from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP
+
+GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
+#: Width of what a teacher adds to an observation.
+GUIDANCE = NUM_ACTIONS + FREQUENCIES
+
+#: The semantic cue: one-hot over the families, and one place for "unknown".
+SEMANTIC = (*FAMILIES, "unknown")
+
+
+class Seen(NamedTuple):
+    """What o^H of M robots is read from.
+
+    Attributes:
+        loco: the robots.
+        goal: (M, 2) m in the world.
+        time_share: (M,) t / T_max.
+        last_action: (M, 13), normalised.
+        families: (M,) index into ``SEMANTIC``.
+        probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
+        late: (M,) how many decisions ago those were measured.
+        closing: (M,) m/s, how fast the goal came nearer since the last decision.
+    """
+
+    loco: Locomotion
+    goal: Array
+    time_share: Array
+    last_action: Array
+    families: NDArray[np.int64]
+    probes: Array
+    late: NDArray[Any]
+    closing: Array
+
+
+def _goal(seen: Seen) -> Array:
+    state = seen.loco.world.state
+    offset = seen.goal - state.position[:, :2]
+    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
+    distance = np.linalg.norm(offset, axis=1)
+    return np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1)
+
+
+def _joint_error(seen: Seen) -> Array:
+    return seen.loco.world.state.q - seen.loco.joint_offset - seen.loco.nominal
+
+
+_FLIP_ACTION = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in (*CONTINUOUS, "gait")))
+_LAYOUT: tuple[Term[Seen], ...] = (
+    Term("goal", 3, _goal, mirror=in_place(1.0, 1.0, -1.0)),
+    Term("time_left", 1, lambda s: 1.0 - s.time_share[:, None]),
+    Term("gravity", 3, lambda s: s.loco.world.state.gravity, mirror=ARROW),
+    Term("joint_error", 12, _joint_error, mirror=JOINTS),
+    Term("joint_speed", 12, lambda s: s.loco.world.state.qd, SPEED_SCALE, mirror=JOINTS),
+    Term("last_action", 13, lambda s: s.last_action, mirror=_FLIP_ACTION),
+    Term("clock", 4, lambda s: s.loco.clock.signal(), mirror=LEGS),
+)
+_COSINE: Term[Seen] = Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), mirror=LEGS)
+_PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
+_AGE: Term[Seen] = Term("probe_age", 1, lambda s: s.late[:, None].astype(np.float64))
+_CLOSING: Term[Seen] = Term("closing_speed", 1, lambda s: s.closing[:, None])
+_CUES: dict[str, Term[Seen]] = {
+    "semantic": Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
+    "geometric": Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
+}
+
+
+def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
+    """The terms of the high policy's observation o^H, in order."""
+    clock = (_COSINE,) if config.clock == "both" else ()
+    cues = [term for cue, term in _CUES.items() if config.cues in ("both", cue)]
+    age = (_AGE,) if config.probe_age and config.cues in ("both", "geometric") else ()
+    closing = (_CLOSING,) if config.closing_speed else ()
+    return (*_LAYOUT, *clock, *cues, *age, *closing)
+
+
+def high_spaces(
+    config: HighLevelConfig, taught: bool = False
+) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """Observations, with the teacher's guidance if there is one, and actions of the high policy."""
+    size = width(high_layout(config)) + taught * GUIDANCE
+    limit = config.action_limit
+    seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+    return seen, gym.spaces.Box(-limit, limit, (NUM_ACTIONS,), np.float32)
+
+
+def high_mirror(config: HighLevelConfig) -> Mirror:
+    """Left-right mirror of the high policy's observations and actions.
+
+    Raises:
+        ConfigError: probes or bounds to one side that are not those to the other.
+    """
+    if config.probes != "lines":
+        raise ConfigError(
+            f"probes that are {config.probes} are not the same on both sides, as a symmetric "
+            "policy needs them; ppo.mirror=false does without symmetry"
+        )
+    for name in SIDEWAYS:
+        low, high = getattr(config.commands or CommandRanges(), name)
+        if low != -high:
+            raise ConfigError(
+                f"commands.{name} must be the same to both sides for a symmetric policy, not "
+                f"{[low, high]}; ppo.mirror=false does without symmetry"
+            )
+    return Mirror(*mirror(high_layout(config)), *_FLIP_ACTION)

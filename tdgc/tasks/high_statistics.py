@@ -1,0 +1,22 @@
+"""The log's values of the high policy's training, made of sums over its decisions."""
+
+from collections.abc import Mapping
+
+from tdgc.sim.gaits import GAITS
+from tdgc.tasks.statistics import mean_rewards
+
+
+def summarise(sums: Mapping[str, float]) -> dict[str, float]:
+    """Sums of ``NavigationTask.take_stats`` over all workers -> values to log."""
+    values = mean_rewards(sums)
+    counts = [k for k in sums if k.startswith("family/") and k.endswith("/count")]
+    families = [k.removeprefix("family/").removesuffix("/count") for k in counts]
+    for family in families:
+        count = max(sums[f"family/{family}/count"], 1.0)
+        values[f"level/{family}"] = sums[f"family/{family}/level"] / count
+        episodes = sums[f"family/{family}/episodes"]
+        if episodes:
+            values[f"success/{family}"] = sums[f"family/{family}/reached"] / episodes
+        for gait in GAITS:
+            values[f"gait/{family}_{gait}"] = sums[f"family/{family}/{gait}"] / count
+    return values

@@ -1,0 +1,61 @@
+"""A low policy from its file, and the MDP of a high policy on it."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from tdgc import policies
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, recorded
+from tdgc.policies import Policy
+from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
+from tdgc.sim.robot import NUM_JOINTS
+
+#: Where the shipped policies are.
+PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
+
+#: What a high policy decides, beside the gait, when its ``behaviour`` is "velocities".
+VELOCITIES = ("vx", "vy", "yaw_rate")
+
+
+def at_default(ranges: CommandRanges) -> CommandRanges:
+    """Bounds that leave only the velocities free: the others at their defaults, or at the bound
+    next to it."""
+    default, pinned = default_command(), {}
+    for name in CONTINUOUS:
+        if name not in VELOCITIES:
+            value = float(np.clip(default[INDEX[name]], *getattr(ranges, name)))
+            pinned[name] = value, value
+    return dataclasses.replace(ranges, **pinned)
+
+
+def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
+    """The MDP of a high policy on a low policy: with the decoder's bounds, the low policy's if it
+    has none.
+
+    Raises:
+        ConfigError: bounds that the low policy was not trained on; names the command and both.
+    """
+    ranges = high.commands or low.commands
+    if high.behaviour == "velocities":
+        ranges = at_default(ranges)
+    for f in dataclasses.fields(low.commands):
+        asked, trained = getattr(ranges, f.name), getattr(low.commands, f.name)
+        if asked[0] < trained[0] or asked[1] > trained[1]:
+            raise ConfigError(
+                f"commands.{f.name} asks for {list(asked)}, but the low policy was trained on "
+                f"{list(trained)}"
+            )
+    return dataclasses.replace(high, commands=ranges)
+
+
+def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
+    """A low policy, given itself or by its path, and the MDP it was trained on.
+
+    Raises:
+        ValueError: a file that cannot be used, or a policy that is no low policy.
+    """
+    name, low = low, low if isinstance(low, Policy) else policies.load(low)
+    if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
+        raise ConfigError(f"{name}: not a low policy of this package")
+    return low, recorded(LowLevelConfig, low.meta["config"], name)
