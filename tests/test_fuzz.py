@@ -256,8 +256,9 @@ def test_any_configuration_of_a_run(folder: Path, content: bytes | Damage) -> No
     good = json.dumps(to_dict(LowTrainConfig())).encode()
     data = content if isinstance(content, bytes) else damaged(good, content)
     (run / "config.json").write_bytes(data)
-    flags = dict.fromkeys(("seed", "n_envs", "workers", "steps", "cluster"))
-    args = Namespace(out=run, resume=True, assignments=[], **flags)
+    flags = dict.fromkeys(("seed", "n_envs", "workers", "steps", "cluster", "init"))
+    flags |= {"out": run, "resume": True, "assignments": [], "device": "cpu", "worker_timeout": 1.0}
+    args = Namespace(**flags)
     found = answer(lambda: configure(LowTrainConfig(), args), ConfigError)
     if found is not None:
         check_config(found)

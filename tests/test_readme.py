@@ -2,12 +2,13 @@
 
 import argparse
 import configparser
+import dataclasses
 import os
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +22,19 @@ import train_low
 from tdgc import bench, calibration, diagnose, export, mujoco
 from tdgc.ablate import __main__ as ablate
 from tdgc.benchmark.evaluation import CONDITIONS
-from tdgc.config import HighLevelConfig, RobotConfig
+from tdgc.config import (
+    HighLevelConfig,
+    HighRewardConfig,
+    LowRewardConfig,
+    RandomisationConfig,
+    RobotConfig,
+)
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.terrain import ALL_FAMILIES, PARAMETER_RANGES
 from tdgc.tasks.high_observation import high_layout
+from tdgc.tasks.rewards import HIGH_TERMS, LOW_TERMS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -337,6 +345,30 @@ def test_observations_are_those_of_the_layouts() -> None:
     for table, layout in zip(tables("commands.md", "Observations"), layouts, strict=True):
         found = [(row[0], int(row[1])) for row in table]
         assert sorted(found) == sorted((term.name, term.size) for term in layout)
+
+
+@pytest.mark.parametrize(
+    ("heading", "terms", "weights"),
+    [
+        ("Rewards of the low policy", LOW_TERMS, LowRewardConfig()),
+        ("Rewards of the high policy", HIGH_TERMS, HighRewardConfig()),
+    ],
+)
+def test_rewards_are_the_defaults(
+    heading: str, terms: Mapping[str, object], weights: LowRewardConfig | HighRewardConfig
+) -> None:
+    found = [row[:2] for row in tables("mdp.md", heading)[0]]
+    assert found == [[name, f"{getattr(weights, name):g}"] for name in terms]
+
+
+def test_what_is_randomised_is_the_default() -> None:
+    expected = []
+    for setting in dataclasses.fields(RandomisationConfig):
+        value = getattr(RandomisationConfig(), setting.name)
+        ends = value if isinstance(value, tuple) else (value,)
+        expected.append([setting.name, " to ".join(f"{end:g}" for end in ends)])
+    found = [row[:2] for row in tables("mdp.md", "What is randomised")[0]]
+    assert sorted([["scale", "1"], *found]) == sorted(expected)
 
 
 def test_families_are_the_terrains() -> None:

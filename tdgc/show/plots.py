@@ -394,11 +394,11 @@ def _draw_command(
 def training_curve(log: Path, out: Path) -> None:
     """The low policy's run: reward, tracking and contact by gait, terrain levels (log.jsonl)."""
     panels: list[tuple[str, dict[str, str] | str]] = [
-        ("reward a step", {"reward/total": "total"}),
+        ("reward per step", {"reward/total": "total"}),
         ("velocity RMSE (m/s)", {f"tracking/{g}_velocity_rmse": g for g in GAITS}),
         ("yaw rate RMSE (rad/s)", {f"tracking/{g}_yaw_rate_rmse": g for g in GAITS}),
-        ("contact as desired", {f"tracking/{g}_contact_match": g for g in GAITS}),
-        ("falls a minute", {"falls_per_minute": "all"}),
+        ("contact as scheduled", {f"tracking/{g}_contact_match": g for g in GAITS}),
+        ("falls per minute", {"falls_per_minute": "all"}),
         ("terrain level", "level/{}"),
     ]
     _curves(log, out, panels, "million control steps")
@@ -411,7 +411,7 @@ def decision_curve(log: Path, out: Path) -> None:
     teacher does not drive.
     """
     panels: list[tuple[str, dict[str, str] | str]] = [
-        ("reward a decision", {"reward/total": "total"}),
+        ("reward per decision", {"reward/total": "total"}),
         ("success", "success/{}"),
         ("level", "level/{}"),
         ("share of decisions in pronk", "gait/{}_pronk"),

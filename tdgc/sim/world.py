@@ -6,6 +6,7 @@ Robots pass through each other (a collision mask). Arrays have a leading axis of
 import contextlib
 import ctypes
 import functools
+import importlib
 import os
 import sys
 import time
@@ -15,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pybullet
 from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
@@ -35,6 +35,21 @@ _GROUND, _ROBOT = 1, 2  # collision groups: robots meet the ground and nothing e
 _PARKED = 50.0  # m above its place nothing touches a robot: terrain stays within HEIGHT_RANGE
 _SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out from it
 _FOOT_REACH = 0.03  # m below the foot's centre sits a contact that is the foot's, not the calf's
+
+
+def _load() -> Any:
+    """PyBullet, whose import says when it was built, in each process and over progress bars."""
+    stream = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        return importlib.import_module("pybullet")
+    finally:
+        os.dup2(stream, 2)
+        os.close(stream)
+
+
+pybullet = _load()
 
 
 class _Client:
