@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from tdgc import __version__, policies
 from tdgc.config import NO_TEACHER, PRESETS, ConfigError, HighTrainConfig, to_dict, with_overrides
+from tdgc.files import checksum
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, shared_keywords
@@ -28,6 +29,7 @@ from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import Policy
+from tdgc.policies.files import header_file
 from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
@@ -61,6 +63,18 @@ def find_low() -> str:
             return str(TRAINED_LOW)
         tqdm.write(f"{TRAINED_LOW} is not calibrated yet, its run has not come to its end")
     return str(PRETRAINED / "low")
+
+
+def pin_low(config: HighTrainConfig) -> HighTrainConfig:
+    """The configuration with the checksum of its low policy.
+
+    Raises:
+        ConfigError: it is another one than that the run began with.
+    """
+    found = checksum(header_file(cast(str, config.low)))
+    if config.low_sha256 not in (None, found):
+        raise ConfigError(f"{config.low} is not the low policy that this run began with")
+    return dataclasses.replace(config, low_sha256=found)
 
 
 def start_command(config: HighTrainConfig) -> Array:
@@ -256,6 +270,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = configure(with_overrides(HighTrainConfig(), preset), args)
         config = dataclasses.replace(config, low=config.low or find_low())
         low, low_config = load_low(cast(str, config.low))
+        config = pin_low(config)
         tqdm.write(f"low policy: {config.low}")
         check_robot(low_config.robot, low_config.physics)
         trunk = read_geometry(low_config.robot).trunk_mass

@@ -90,7 +90,7 @@ class StoppedError(Exception):
 def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> None:
     """The last phase: the calibrated copy takes the place of the policy that learned.
 
-    What learned stays beside it as ``uncalibrated``. An interrupted calibration begins anew when
+    What learned stays beside it as ``uncalibrated``. An interrupted calibration starts over when
     the run is resumed, and ends the same.
 
     Raises:

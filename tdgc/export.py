@@ -29,8 +29,9 @@ from tdgc.benchmark.drivers import HierarchyDriver, load_high
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig
 from tdgc.deploy.controller import FORMATS, Controller, quiet
 from tdgc.deploy.graphs import HighGraph, LowGraph, Signal
-from tdgc.deploy.interface import VERSION, Table, checksum, interface_path
+from tdgc.deploy.interface import VERSION, Table, interface_path
 from tdgc.errors import require
+from tdgc.files import checksum
 from tdgc.policies import Policy
 from tdgc.sim.commands import CONTINUOUS, NAMES, UNITS, CommandDecoder, default_command
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS

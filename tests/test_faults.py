@@ -157,7 +157,7 @@ def test_workers_that_die_or_raise_are_started_anew(fragile: TaskVecEnv) -> None
         assert obs[:2, 1].tolist() == obs[:2, 2].tolist() == [seen[0, 1] + 1] * 2
         mended = fragile.faults.pop()
         assert (mended.worker, mended.restarts, mended.seed) == (1, restarts, seed)
-        assert str(mended) == f"{reason}; started anew with seed {seed} (restart {restarts})"
+        assert str(mended) == f"{reason}; restarted with seed {seed} (restart {restarts})"
         assert ("Traceback" in mended.reason) == (fault == RAISE)
         obs, rewards, dones, _ = step(fragile, actions())
         assert not dones.any() and rewards.tolist() == [1.0] * 4
@@ -363,4 +363,4 @@ def test_nothing_outlives_the_parent(killed: bool, tmp_path: Path) -> None:
 
 def test_a_fault_in_one_line() -> None:
     fault = Fault(1, "worker 1 failed:\nTraceback ...\nKeyError: 'x'\n", 2, 9)
-    assert str(fault) == "worker 1 failed: KeyError: 'x'; started anew with seed 9 (restart 2)"
+    assert str(fault) == "worker 1 failed: KeyError: 'x'; restarted with seed 9 (restart 2)"

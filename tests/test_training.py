@@ -398,7 +398,7 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
 
 
 def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Five updates of the recurrent learner, which remembers the episodes under way: two of
     imitation and three of reinforcement learning. The second run has a checkpoint after each, is
@@ -434,6 +434,12 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     # Flags that it cannot go on with leave it as it is.
     config = (broken / "config.json").read_text(encoding="utf-8")
     assert train_high.main(["--resume", "--out", str(broken), "--n-envs", "3"]) == 2
+    other = tmp_path / "other"
+    low = policies.load(PRETRAINED / "low")
+    policies.save_copy(other, low, low.actor.tensors(), {**low.meta, "note": "trained on"})
+    assert train_high.main(["--resume", "--out", str(broken), "--low", str(other)]) == 2
+    error = capsys.readouterr().err
+    assert f"train_high.py: {other} is not the low policy that this run began with" in error
     assert (broken / "config.json").read_text(encoding="utf-8") == config
     kill_run("train_high.py", ["--resume", "--out", str(broken)], last, after=0.05)
     cut = Checkpoint.read(newest(broken))
@@ -538,7 +544,7 @@ def test_faults_of_a_run(
     assert "no checkpoint at 16 steps, the one before stays: [Errno 27] File too large" in output
     assert "no log row at 32 steps: [Errno 27] File too large" in output
     seed = worker_seed(3, 0, 1)
-    assert f"worker 0 died (exit code -9); started anew with seed {seed} (restart 1)" in output
+    assert f"worker 0 died (exit code -9); restarted with seed {seed} (restart 1)" in output
     assert f"stopped by the test; --resume --out {tmp_path} goes on" in output
     names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert names == ["step-000000000048", "step-000000000064"]

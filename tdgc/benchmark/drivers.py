@@ -88,7 +88,7 @@ class GoToGoal:
 
 
 class BaselineDriver(Driver):
-    """Drives robots by ``GoToGoal``, anew at every control step; it knows no families.
+    """Drives robots by ``GoToGoal``, at every control step; it knows no families.
 
     Commands of the law outside ``bounds`` are clipped to them: it has one setting for all low
     policies.

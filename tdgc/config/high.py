@@ -11,6 +11,8 @@ from tdgc.config.sim import CommandRanges, RandomisationConfig
 class HighRewardConfig:
     """Weights and constants of the high policy's reward (Sec. IV-B), one weight per term.
 
+    The paper gives the terms and no numbers, so those without an origin of their own are ours.
+
     Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the step's
     duration, unless ``step_time_scaling`` is off: then they are per decision.
     """

@@ -118,7 +118,7 @@ class LowLevelConfig:
     # and trenches, twice as many, are what it is still learning when slopes are easy.
     families: tuple[str, ...] = ("stair", "stair", "gap", "gap", "tilt", "rough")
     episode_seconds: Positive = 20.0
-    command_seconds: NotNegative = 2.5  # a new command and gait that often
+    command_seconds: NotNegative = 2.5  # a new command and gait that often; 0: none but the first
     gyro: bool = True  # adds the angular velocity of the base to the actor's observation
     command_start: Share = 0.4  # share of the velocity ranges at the start of the curriculum
     robot: RobotConfig = field(default_factory=RobotConfig)

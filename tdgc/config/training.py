@@ -136,6 +136,8 @@ class HighTrainConfig:
     start_swing: NotNegative = field(default=0.08, metadata={"before": 0.08})
     # The low policy: by default what train_low.py left in runs/low, or else the shipped one.
     low: str | None = None
+    # SHA-256 of its .json, where that of its weights stands, too: a run goes on with no other.
+    low_sha256: str | None = field(default=None, metadata={"before": None})
     env: HighLevelConfig = field(default_factory=HighLevelConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     ppo: RecurrentPPOConfig = field(default_factory=RecurrentPPOConfig)

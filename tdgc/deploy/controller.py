@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from tdgc.config import CommandRanges, RobotConfig
-from tdgc.deploy.interface import ExportError, Table, checksum, read_interface
+from tdgc.deploy.interface import ExportError, Table, read_interface
+from tdgc.files import checksum
 from tdgc.sim.commands import CONTINUOUS
 from tdgc.sim.geometry import JOINTS, read_geometry
 from tdgc.sim.robot import NUM_JOINTS, Array, RobotState, nominal_height, nominal_pose

@@ -4,7 +4,6 @@
 """
 
 import functools
-import hashlib
 import json
 import textwrap
 from pathlib import Path
@@ -60,8 +59,3 @@ def _validator(name: str) -> Any:
 
     definitions = json.loads(SCHEMA.read_text(encoding="utf-8"))["$defs"]
     return Draft202012Validator({"$defs": definitions, "$ref": f"#/$defs/{name}"})
-
-
-def checksum(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -52,7 +52,7 @@ class TaskGroup:
         return np.concatenate([task.observe() for task in self.tasks])
 
     def restart(self) -> None:
-        """End every episode and build the worlds anew."""
+        """End every episode and rebuild the worlds."""
         for task in self.tasks:
             task.restart()
 

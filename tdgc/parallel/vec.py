@@ -37,7 +37,7 @@ class Fault:
     Attributes:
         worker: its number.
         reason: how it failed, with its own traceback if it has one.
-        restarts: how often this worker has been started anew by now.
+        restarts: how often this worker has been restarted by now.
         seed: of the new worker's task, see ``worker_seed``.
     """
 
@@ -49,7 +49,7 @@ class Fault:
     def __str__(self) -> str:
         lines = self.reason.splitlines()
         reason = " ".join(dict.fromkeys((lines[0], lines[-1])))
-        return f"{reason}; started anew with seed {self.seed} (restart {self.restarts})"
+        return f"{reason}; restarted with seed {self.seed} (restart {self.restarts})"
 
 
 def worker_seed(seed: int, worker: int, restarts: int = 0) -> int:
@@ -69,7 +69,7 @@ class TaskVecEnv(VecEnv):
     Robots whose episode ended are reset within ``step``; ``infos`` holds their last observation
     and whether they were truncated, as SB3 expects.
 
-    With ``recover`` a worker that dies, hangs or raises is started anew with a seed of its own and
+    With ``recover`` a worker that dies, hangs or raises is restarted with a seed of its own and
     what its robots had learned when its state was last asked for (see ``state_dicts``); their
     episodes end, truncated, with no reward for the step. Faults at ``FAULTS`` times within
     ``FAULT_STEPS`` steps are raised all the same.
@@ -80,10 +80,10 @@ class TaskVecEnv(VecEnv):
         workers: their number; the robots are shared out evenly.
         seed: from which each worker's seed is drawn.
         spaces: observation and action space of the task.
-        recover: start workers that fail anew; otherwise the first fault is raised.
+        recover: restart workers that fail; otherwise the first fault is raised.
         timeout: s without an answer after which a worker counts as hung. Of all that is asked,
             building the worlds of 60 robots on terrain takes longest: 3 s of a core.
-        link: starts a worker; a process of this machine unless told.
+        link: starts a worker; by default a process of this machine.
 
     Attributes:
         faults: those mended so far; whoever tells of them takes them out.
@@ -170,7 +170,7 @@ class TaskVecEnv(VecEnv):
         """Every worker's answer, or its ``WorkerError``.
 
         Raises:
-            WorkerError: one failed, and no worker is to be started anew.
+            WorkerError: one failed, and no worker is to be restarted.
         """
         answers = [self._receive(k, self.timeout) for k in range(len(self._links))]
         if self._broken and not self._recover:
@@ -182,7 +182,7 @@ class TaskVecEnv(VecEnv):
         return self._receive_all()
 
     def _mend(self) -> NDArray[np.bool_]:
-        """Start the broken workers anew; their robots have new observations.
+        """Restart the broken workers; their robots have new observations.
 
         Returns:
             (num_envs,) the robots concerned.
@@ -285,7 +285,7 @@ class TaskVecEnv(VecEnv):
         return states
 
     def load_state_dicts(self, states: list[State]) -> None:
-        """Go on from the workers' states; episodes that are missing in one begin anew.
+        """Go on from the workers' states; episodes that are missing in one start over.
 
         Raises:
             ValueError: states of another number of workers or robots.

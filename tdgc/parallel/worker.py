@@ -166,7 +166,7 @@ def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
     obs = task.observe()
     blown = ~((np.abs(obs) <= SANE).all(axis=1) & (np.abs(reward) <= SANE))
     # A robot with a NaN leaves Bullet's broad phase in disorder for good: the others of its client
-    # fall through the ground. So the worlds are built anew, which ends every episode in them.
+    # fall through the ground. So the worlds are rebuilt, which ends every episode in them.
     poisoned = not (np.isfinite(obs).all() and np.isfinite(reward).all())
     obs[blown], reward[blown] = views["obs"][blown], 0.0
     terminated &= ~blown
@@ -309,7 +309,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
 def keep_memory() -> None:
     """Let this process keep the memory that it frees, where the C library is glibc.
 
-    A batch's tiles take hundreds of MB. Taking them anew from the system, page by page, was four
+    A batch's tiles take hundreds of MB. Taking them again from the system, page by page, was four
     fifths of the time in which a world is made.
     """
     libc = ctypes.CDLL(None)

@@ -319,6 +319,12 @@ def store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Te
     _write(_with_suffix(stem, ".json"), text)
 
 
+def header_file(path: str | os.PathLike[str]) -> Path:
+    """The ``NAME.json`` of a policy that is named with or without a suffix; the checksum of its
+    weights stands in it."""
+    return _with_suffix(_stem(path), ".json")
+
+
 def _stem(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     return path.with_suffix("") if path.suffix in (".safetensors", ".json") else path

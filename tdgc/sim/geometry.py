@@ -81,7 +81,7 @@ def urdf_path(config: RobotConfig) -> Path:
 def read_geometry(config: RobotConfig) -> Geometry:
     """The geometry of the robot whose URDF ``config`` names.
 
-    It is read anew at each call, as Bullet reads it for each robot: a world reads it once and
+    It is read at each call, as Bullet reads it for each robot: a world reads it once and
     keeps it. docs/robot.md says what a URDF must have.
 
     Raises:

@@ -55,7 +55,7 @@ pybullet = _load()
 class _Client:
     """pybullet's functions bound to one connection.
 
-    pybullet_utils' BulletClient binds anew at every call, which costs as much as a short call; here
+    pybullet_utils' BulletClient binds at every call, which costs as much as a short call; here
     each function is bound once, at its first use.
     """
 
@@ -323,7 +323,7 @@ class World:
         """Let Bullet forget the contacts of the steps before; ``state`` stays as it is.
 
         Bullet starts its solver from the last step's contact forces. Afterwards what follows is
-        what would follow in a world built anew with the same ``state``, strength and dynamics, bit
+        what would follow in a world rebuilt with the same ``state``, strength and dynamics, bit
         for bit. For that every robot spends one physics step high above the ground.
         """
         for i in self._active:
@@ -504,7 +504,7 @@ class World:
     ) -> NDArray[np.uint8]:
         """Robot ``row`` and its ground from the side, (height, width, 3), without a display.
 
-        The camera looks at ``target`` (3,) m, the trunk unless told, from ``distance`` m away:
+        The camera looks at ``target`` (3,) m, the trunk by default, from ``distance`` m away:
         ``azimuth`` rad from the world's x axis and ``elevation`` rad above the target. Worlds that
         were not made with ``visual`` have nothing to show.
         """

@@ -24,7 +24,7 @@ class Approach:
         self.distance, self.speed = np.zeros((2, loco.num_robots))
 
     def begin(self, index: NDArray[np.integer], goal: Array) -> None:
-        """Start anew for the robots ``index`` (n,); ``goal`` (M, 2) m in the world."""
+        """Start over for the robots ``index`` (n,); ``goal`` (M, 2) m in the world."""
         self.distance[index], self.speed[index] = self._measure(goal)[index], 0.0
 
     def measure(self, goal: Array) -> None:

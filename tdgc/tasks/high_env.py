@@ -204,7 +204,7 @@ class NavigationTask:
         return self.curriculum.levels / max(self.config.levels - 1, 1)
 
     def restart(self) -> None:
-        """End every episode, draw new tiles and build the world anew (see ``LowLevelTask``)."""
+        """End every episode, draw new tiles and rebuild the world (see ``LowLevelTask``)."""
         self.locomotion.world.close()
         self._build_robots()
         self.reset(np.arange(self.num_robots))

@@ -274,7 +274,7 @@ class HighStep:
     """All that the high policy's terms look at, one decision of M robots (Sec. IV-B).
 
     Attributes:
-        distance: (M,) m to the goal, d_t.
+        distance: (M,) m to the goal on the map, d_t; a goal has no height here.
         heading_error: (M,) rad, psi* - psi.
         time_share: (M,) t / T_max.
         lin_vel, ang_vel: (M, 3) of the base, m/s and rad/s; joint_speed: (M, 12) rad/s.

@@ -27,7 +27,7 @@ def outcome(
 
     Args:
         world: the robots; on a plane, which has no field, there is no tile to leave.
-        goal: (M, 2) m in the world; without one nothing is reached.
+        goal: (M, 2) m in the world, reached on the map; without one nothing is reached.
         time_is_up: (M,), or one for all.
     """
     x, y, z = world.state.position.T
