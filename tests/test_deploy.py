@@ -15,8 +15,9 @@ from jsonschema import Draft202012Validator
 from tdgc import diagnose, export
 from tdgc.deploy import log
 from tdgc.deploy.controller import GRAPHS, Controller
-from tdgc.deploy.interface import SCHEMA, ExportError, checksum, read_interface
+from tdgc.deploy.interface import SCHEMA, ExportError, read_interface
 from tdgc.deploy.log import LogError, LogWriter
+from tdgc.files import checksum
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import RobotState
 from tdgc.tasks.pairing import PRETRAINED

@@ -20,8 +20,9 @@ from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
 from tdgc.deploy.controller import FORMATS, Graph
 from tdgc.deploy.graphs import HighGraph, LowGraph, by_command, foot_phases
-from tdgc.deploy.interface import ExportError, checksum
+from tdgc.deploy.interface import ExportError
 from tdgc.export import TOLERANCE
+from tdgc.files import checksum
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
 from tdgc.sim.commands import CommandDecoder
