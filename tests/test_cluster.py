@@ -237,7 +237,7 @@ def test_workers_that_are_lost_are_started_elsewhere(joined: Cluster, fragile: T
 
     step(env, actions(8, r0=RAISE))
     assert str(env.faults[-1]).startswith(
-        "worker 0 failed: ValueError: the ground is gone; started"
+        "worker 0 failed: ValueError: the ground is gone; restarted"
     )
     assert "in step" in env.faults[-1].reason and "\x1b" not in env.faults[-1].reason
     obs, _, dones, _ = step(env, actions(8))
