@@ -77,14 +77,21 @@ def pin_low(config: HighTrainConfig) -> HighTrainConfig:
     return dataclasses.replace(config, low_sha256=found)
 
 
-def start_command(config: HighTrainConfig) -> Array:
-    """Walking straight on in the default gait, (15,)."""
+def start_action(config: HighTrainConfig) -> Array:
+    """The action of walking straight on in the default gait, (13,).
+
+    Raises:
+        ConfigError: gaits that are none, or a speed or swing outside the decoder's bounds.
+    """
     decoder = CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
     command = decoder.nearest(default_command())
     command[INDEX["vx"]] = config.start_speed
     if config.env.behaviour == "all":
         command[INDEX["swing_height"]] = config.start_swing
-    return command
+    try:
+        return decoder.encode(command)
+    except ValueError as error:
+        raise ConfigError(f"'start_speed' or 'start_swing' cannot be walked: {error}") from None
 
 
 def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
@@ -93,12 +100,10 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
     Its exploration then stumbles on goals from the first episodes; around the middle of the bounds
     it would stand still in a random gait.
     """
-    decoder = CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
-    command = start_command(config)
     with th.no_grad():
         head = policy.action_net
         bias = (head.linear if isinstance(head, MirroredHead) else head).get_parameter("bias")
-        bias.copy_(th.from_numpy(decoder.encode(command)))
+        bias.copy_(th.from_numpy(start_action(config)))
         policy.log_std[-1] = math.log(config.ppo.initial_gait_std)
 
 
@@ -236,11 +241,7 @@ def check(config: HighTrainConfig) -> None:
                 raise ConfigError(f"'ppo.{name}' needs an 'ppo.ent_coef' above 0; or set it to 0")
     if ppo.mirror:
         high_mirror(env)
-    start = start_command(config)
-    try:
-        CommandDecoder(env.commands, env.action_limit, env.gaits).encode(start)
-    except ValueError as error:
-        raise ConfigError(f"'start_speed' or 'start_swing' cannot be walked: {error}") from None
+    start_action(config)
 
 
 def main(arguments: list[str] | None = None) -> int:

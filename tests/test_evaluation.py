@@ -24,7 +24,6 @@ from tdgc.benchmark.evaluation import (
     CONDITIONS,
     Cell,
     complete,
-    low_config,
     physics_of,
     plan,
     push_velocities,
@@ -119,7 +118,7 @@ def test_conditions_are_the_benchmarks():
 
 
 def test_physics_at_1000_hz_keeps_the_control_rate(low):
-    config = low_config(low)
+    config = load_low(low)[1]
     fast = physics_of(config, CONDITIONS["physics-1000hz"])
     assert fast.substeps == 20 and fast.dt == pytest.approx(0.001)
     assert physics_of(config, CONDITIONS["nominal"]).dt == pytest.approx(0.0025)
@@ -249,7 +248,7 @@ class Recorder(HierarchyDriver):
 
 def test_shares_are_of_the_gaits_commanded(low, high, monkeypatch):
     monkeypatch.setattr(evaluation, "HORIZON", 1.0)
-    driver = Recorder(*load_high(high, low, low_config(low)))
+    driver = Recorder(*load_high(high, low, load_low(low)[1]))
     episodes = run_cell(Cell("tdgc", "nominal", "rough", 0, 0, 2), low, driver, seed=0)
     assert np.count_nonzero(episodes[0].shares) > 1
     for k, episode in enumerate(episodes):
@@ -306,7 +305,7 @@ def test_the_table_does_not_depend_on_the_processes(table, low, high, tmp_path):
         assert (tmp_path / name).read_bytes() == (table / name).read_bytes()
     with np.load(table / "trajectories.npz") as one, np.load(tmp_path / "trajectories.npz") as two:
         assert all(np.array_equal(one[key], two[key]) for key in ("poses", "counts", "goals"))
-    driver = HierarchyDriver(*load_high(high, low, low_config(low)))
+    driver = HierarchyDriver(*load_high(high, low, load_low(low)[1]))
     here = run_cell(Cell("tdgc", "nominal", "gap", 10, 0, 2), low, driver, seed=3)
     assert [{k: str(v) for k, v in e.row().items()} for e in here] == rows_of(table)[:2]
 
@@ -388,7 +387,7 @@ def test_an_evaluation_checks_itself():
 
 def test_the_baseline_keeps_to_what_the_low_policy_was_trained_on(low):
     narrow = dataclasses.replace(CommandRanges(), vx=(-0.3, 0.3))
-    config = dataclasses.replace(low_config(low), commands=narrow)
+    config = dataclasses.replace(load_low(low)[1], commands=narrow)
     asked = evaluate.Evaluation.of(evaluate.parse(["--policies", "gp", "--workers", "1"]))
     assert asked.drivers(low, config)["gp"].bounds == narrow
 
@@ -403,7 +402,7 @@ def test_the_robot_is_read_for_diagnoses_alone(low, monkeypatch):
     plain = evaluate.run_one(cell, low, drivers, 5, 0, None)
     assert (robots, plain.diagnoses, plain.traces) == ([], [], [])
     traced = evaluate.run_one(cell, low, drivers, 5, 0, Selection.parse("failed"))
-    assert robots == [low_config(low).robot]
+    assert robots == [load_low(low)[1].robot]
     assert (
         [d.outcome for d in traced.diagnoses] == [t.outcome for t in traced.traces] == ["timeout"]
     )
@@ -499,7 +498,7 @@ def test_a_tracking_that_is_stopped_is_one_line(tmp_path, monkeypatch, capsys):
 
 def test_a_training_may_rewrite_the_policy_meanwhile(low, tmp_path, monkeypatch):
     monkeypatch.setattr(evaluation, "HORIZON", 0.04)
-    high = save_high(tmp_path / "high", (low, low_config(low)), meta={"benchmark": 2})
+    high = save_high(tmp_path / "high", (low, load_low(low)[1]), meta={"benchmark": 2})
 
     def run_jobs(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:
         high.with_suffix(".json").write_text("{", encoding="utf-8")

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from tdgc.ablate.trials import Result, Tile, Trial
 from tdgc.ablate.variants import WHOLE
-from tdgc.benchmark.results import paired_interval, wilson_interval
+from tdgc.benchmark.results import Z_95, paired_interval, wilson_interval
 
 #: What a trial came to, or the message of its error.
 Found = Result | str
-_Z = 1.959964  # 95 % of a normal distribution are within so many deviations
 
 
 def rows(
@@ -75,7 +74,7 @@ def rates(reached: NDArray[np.bool_]) -> dict[str, float]:
     """
     seeds, n = reached.shape
     good = int(reached.sum())
-    low, high = wilson_interval(good, reached.size, _Z * wider(reached))
+    low, high = wilson_interval(good, reached.size, Z_95 * wider(reached))
     return {
         "n": n,
         "reached": good / seeds,
@@ -94,7 +93,7 @@ def difference(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str,
         int(tiles.sum())
         for tiles in (first & second, first & ~second, ~first & second, ~first & ~second)
     )
-    z = _Z * wider(first.astype(float) - second)
+    z = Z_95 * wider(first.astype(float) - second)
     low, high = paired_interval(both, gained, lost, neither, z)
     return {
         "n": n,

@@ -163,15 +163,6 @@ class Episode(EpisodeRecord):
         return row | {f"share_{g}": round(x, 4) for g, x in zip(GAITS, self.shares, strict=True)}
 
 
-def low_config(low: Policy) -> LowLevelConfig:
-    """The MDP that a low policy was trained on, from its own file.
-
-    Raises:
-        ValueError: it is no low policy.
-    """
-    return load_low(low)[1]
-
-
 def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
     """The condition's physics: its rate, at the low policy's control rate."""
     physics = config.physics
@@ -364,7 +355,7 @@ def run_cell(
     Returns:
         An episode each, in order.
     """
-    batch = Batch(cell, low_config(low), seed)
+    batch = Batch(cell, load_low(low)[1], seed)
     try:
         driver.begin(batch.loco, batch.goal, batch.told, batch.probes)
         for watcher in watchers:

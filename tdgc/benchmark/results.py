@@ -27,7 +27,11 @@ PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
 
 
-def wilson_interval(reached: int, n: int, z: float = 1.959964) -> tuple[float, float]:
+#: 95 % of a normal distribution are within so many deviations.
+Z_95 = 1.959964
+
+
+def wilson_interval(reached: int, n: int, z: float = Z_95) -> tuple[float, float]:
     """Wilson score interval of a rate, 95 % by default (Wilson 1927)."""
     if not 0 <= reached <= n or n < 1:
         raise ValueError(f"need 0 <= reached <= n and n >= 1, not {reached} of {n}")
@@ -38,7 +42,7 @@ def wilson_interval(reached: int, n: int, z: float = 1.959964) -> tuple[float, f
 
 
 def paired_interval(
-    both: int, first: int, second: int, neither: int, z: float = 1.959964
+    both: int, first: int, second: int, neither: int, z: float = Z_95
 ) -> tuple[float, float]:
     """Interval of the difference of two rates on the same tiles, the first's less the second's.
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.benchmark.evaluation import low_config
 from tdgc.config import CommandRanges
 from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy
@@ -17,6 +16,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EVAL_STREAM
 from tdgc.tasks.executor import Executor
+from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rewards import CONTACT_FORCE
 from tdgc.tasks.rules import is_fallen
 
@@ -40,7 +40,7 @@ def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Lo
 
     Yields before each control step, so that the caller may set commands and look.
     """
-    config = low_config(low)
+    config = load_low(low)[1]
     loco = Locomotion(m, config.robot, config.physics, None, config.gyro)
     executor, rows = Executor(loco, low), np.arange(m)
     rng = np.random.default_rng(seed)
@@ -60,7 +60,7 @@ def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, fl
     RMSE of the instantaneous planar velocity (heading frame) and yaw rate at every control step
     after the first second, and the share of foot samples whose contact is the desired one.
     """
-    config, g = low_config(low), GAITS.index(gait)
+    config, g = load_low(low)[1], GAITS.index(gait)
     rng = np.random.default_rng((EVAL_STREAM, seed, g))
     command = draw_commands(rng, config.commands, np.full(episodes, g))
     settle = round(_SETTLE_SECONDS / config.physics.control_dt)
@@ -86,7 +86,7 @@ def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
 
     A robot that falls stays out, and its time counts up to the fall.
     """
-    config = low_config(low)
+    config = load_low(low)[1]
     m, dt = robots, config.physics.control_dt
     rng = np.random.default_rng((EVAL_STREAM, seed, len(GAITS)))
     switch = round(_SWITCH_SECONDS / dt)

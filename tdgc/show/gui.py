@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import Cell, low_config, run_cell, tile_of
+from tdgc.benchmark.evaluation import Cell, run_cell, tile_of
 from tdgc.policies import Policy
 from tdgc.show.film import field_of, set_stage
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, CommandDecoder, default_command, gait_index
@@ -20,6 +20,7 @@ from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
 from tdgc.sim.world import Stage, WindowError
 from tdgc.tasks.executor import Executor
+from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import GOING, OUTCOMES, outcome
 
 MODES = ("drive", "watch")
@@ -79,7 +80,7 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
     Raises:
         WindowError: the window cannot be opened.
     """
-    config, tile = low_config(low), tile_of(seed, cell.family, cell.level, cell.first)
+    config, tile = load_low(low)[1], tile_of(seed, cell.family, cell.level, cell.first)
     stage, field = set_stage(tile, config.robot, window=True), field_of(tile)
     loco = Locomotion(1, config.robot, config.physics, field, config.gyro)
     executor = Executor(loco, low)
@@ -148,7 +149,7 @@ def watch(low: Policy, driver: Driver, cell: Cell, seed: int) -> None:
         WindowError: the window cannot be opened.
     """
     tile = tile_of(seed, cell.family, cell.level, cell.first)
-    stage = set_stage(tile, low_config(low).robot, window=True)
+    stage = set_stage(tile, load_low(low)[1].robot, window=True)
     try:
         monitor = Monitor(stage)
         run_cell(cell, low, driver, seed, [monitor])
