@@ -331,6 +331,16 @@ def test_time_that_is_over_stops_before_a_trial(
     assert not (tmp_path / "full-42").exists()
 
 
+def test_a_table_that_cannot_be_written_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "ablation.txt").mkdir()
+    limits = ["--only", "full", "--time-limit", "0"]
+    assert main([*TINY, *limits, "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("tdgc.ablate: [Errno 21] Is a directory: ") and said.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train_high
 import train_low
@@ -36,7 +37,7 @@ from tdgc.config import (
 )
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import add_arguments, configure
-from tdgc.learn.run import Interruption, append_line, drop_rows_after
+from tdgc.learn.run import Interruption, append_line, drop_rows_after, tensorboard_logger
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
 from tdgc.policies import AsymmetricActorCriticPolicy
@@ -241,6 +242,18 @@ def test_rows_that_a_resumed_run_writes_again_are_dropped(tmp_path: Path) -> Non
     drop_rows_after(250, log)
     append_line(log, '{"steps": 260}')
     assert log.read_text().split("\n") == [*lines[:2], '{"steps": 260}', ""]
+
+
+def test_tensorboard_shows_what_a_resumed_run_wrote_again_once(tmp_path: Path) -> None:
+    for begins, rows_of in ((0, {100: 1.0, 200: 2.0, 300: 3.0}), (200, {300: 4.0})):
+        logger = tensorboard_logger(tmp_path, begins)
+        for steps, value in rows_of.items():
+            logger.record("reward", value)
+            logger.dump(steps)
+        logger.close()
+        time.sleep(1.0)  # TensorBoard orders files by the second in their names
+    shown = EventAccumulator(str(tmp_path)).Reload().Scalars("reward")
+    assert [(event.step, event.value) for event in shown] == [(100, 1.0), (200, 2.0), (300, 4.0)]
 
 
 def test_time_limit() -> None:

@@ -26,6 +26,7 @@ from tdgc.ablate.trials import Runner, StoppedError, Tile, Trial, TrialError
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
+from tdgc.files import atomic
 from tdgc.parallel.cores import workers_flag
 from tdgc.show import plots
 from tdgc.tasks.pairing import PRETRAINED, load_low
@@ -141,10 +142,14 @@ def report(
     """Write ablation.json, ablation.txt and ablation.png of what there is by now; returns the
     text."""
     table = rows(tiles, trials, found)
-    text = json.dumps({"settings": common, "rows": table}, indent=2)
-    (out / "ablation.json").write_text(text, encoding="utf-8")
     described = describe(table)
-    (out / "ablation.txt").write_text(f"{described}\n", encoding="utf-8")
+    written = {
+        "ablation.json": json.dumps({"settings": common, "rows": table}, indent=2),
+        "ablation.txt": f"{described}\n",
+    }
+    for name, text in written.items():
+        with atomic(out / name) as partial:
+            partial.write_text(text, encoding="utf-8")
     plots.ablation(out / "ablation.json", out / "ablation.png")
     return described
 
@@ -165,17 +170,21 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"tdgc.ablate: {error}", file=sys.stderr)
         return 2
     trials, found, stopped = plan(chosen, seeds), dict[Trial, Found](), False
-    for trial in trials:
-        print(f"{trial.name}: {trial.variant.what}", flush=True)
-        try:
-            found[trial] = runner.run(trial)
-        except TrialError as error:
-            found[trial] = str(error)
-        except StoppedError:
-            stopped = True
-            break
-        report(args.out, common, tiles, trials, found)
-    print(report(args.out, common, tiles, trials, found))
+    try:
+        for trial in trials:
+            print(f"{trial.name}: {trial.variant.what}", flush=True)
+            try:
+                found[trial] = runner.run(trial)
+            except TrialError as error:
+                found[trial] = str(error)
+            except StoppedError:
+                stopped = True
+                break
+            report(args.out, common, tiles, trials, found)
+        print(report(args.out, common, tiles, trials, found))
+    except OSError as error:  # what is done is in the trials' folders
+        print(f"tdgc.ablate: {error}", file=sys.stderr)
+        return 1
     if stopped:
         print("stopped; the same command goes on")
     failed = {trial.name: message for trial, message in found.items() if isinstance(message, str)}

@@ -24,6 +24,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.policies import ActorCriticPolicy
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tqdm import tqdm
 
 from tdgc import policies
@@ -140,7 +141,8 @@ class Run:
         phase's end, and why that could not be written, if it could not."""
         model, env = phase.build(self.worker_timeout, self.link)
         try:
-            model.set_logger(tensorboard_logger(self.folder / "tensorboard"))
+            begins = 0 if last is None else last.steps
+            model.set_logger(tensorboard_logger(self.folder / "tensorboard", begins))
             if last is not None:
                 last.restore(model)
                 states = last.workers()
@@ -304,7 +306,8 @@ class RunCallback(BaseCallback):
         try:
             append_line(self.run.folder / "log.jsonl", json.dumps(row))
             if self._tensorboard_failed:  # its writer never recovers from an error
-                self.model.set_logger(tensorboard_logger(self.run.folder / "tensorboard"))
+                folder = self.run.folder / "tensorboard"
+                self.model.set_logger(tensorboard_logger(folder, steps))
             for key, value in values.items():
                 self.logger.record(key, value)
             self.logger.dump(self.num_timesteps)
@@ -378,6 +381,11 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
     return bool(model.num_timesteps >= until)
 
 
-def tensorboard_logger(folder: Path) -> Logger:
-    """SB3's logger, writing TensorBoard's event files only."""
-    return Logger(str(folder), [TensorBoardOutputFormat(str(folder))])
+def tensorboard_logger(folder: Path, steps: int) -> Logger:
+    """SB3's logger, writing TensorBoard's event files only, of a run that goes on from ``steps``:
+    TensorBoard shows nothing later that was logged before, since a killed run lost it."""
+    output = TensorBoardOutputFormat(str(folder))
+    restart = SessionLog(status=SessionLog.START)
+    writer = cast(Any, output.writer.file_writer)  # whose type torch does not tell
+    writer.add_event(Event(step=steps + 1, session_log=restart))
+    return Logger(str(folder), [output])
