@@ -24,7 +24,7 @@ from tdgc.files import checksum
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, shared_keywords
-from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise
+from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, MemoryExchange
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
@@ -40,7 +40,7 @@ from tdgc.sim.terrain import EDITION
 from tdgc.sim.world import check_robot
 from tdgc.tasks.curriculum import check_rules
 from tdgc.tasks.high_env import NavigationTask
-from tdgc.tasks.high_observation import high_mirror, high_spaces
+from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
@@ -137,7 +137,9 @@ def make_learner(
     **changed: Any,
 ) -> FastRecurrentPPO:
     """A recurrent learner that begins by walking straight on; ``changed`` are PPO's keywords."""
-    ppo = config.ppo
+    ppo, exchange = config.ppo, None
+    if ppo.memory_exchange:
+        exchange = MemoryExchange(ppo.memory_exchange, untold_column(config.env))
     keywords = {
         "learning_rate": LinearRate(ppo.learning_rate, ppo.final_learning_rate),
         "batch_size": ppo.n_steps * config.n_envs // ppo.minibatches,
@@ -155,6 +157,7 @@ def make_learner(
             "mirror": high_mirror(config.env) if ppo.mirror else None,
         },
         gait_ent_coef=ppo.gait_ent_coef,
+        exchange=exchange,
         seed=config.seed,
         device=device,
         **keywords,

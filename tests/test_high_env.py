@@ -28,7 +28,7 @@ from tdgc.sim.terrain import TILE_SIZE, make_tile
 from tdgc.tasks import rewards
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
-from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, high_layout, high_mirror
+from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, high_layout, high_mirror, untold_column
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
@@ -242,17 +242,28 @@ def test_the_teachers_episodes_move_no_levels():
     task.close()
 
 
-def test_some_robots_in_training_are_not_told_their_family():
-    """Of 20 robots of two families the last two of each; in an evaluation all are told."""
+def test_some_episodes_in_training_are_not_told_their_family():
+    """Of 400 episodes of two families a fifth, of either family; in an evaluation all are told."""
     config = dataclasses.replace(CONFIG, families=("tilt", "rough"), unknown_share=0.2)
     where = columns(high_layout(CONFIG))["family"]
-    for training, unknown in ((True, [16, 17, 18, 19]), (False, [])):
+    names = np.tile([SEMANTIC.index("tilt"), SEMANTIC.index("rough")], 10)
+    for training in (True, False):
         task = NavigationTask(config, LOW, 20, seed=0, training=training)
-        task.reset(np.arange(20))
-        told = task.observe()[:, where].argmax(axis=1)
+        unknown = np.zeros((20, 20), dtype=bool)
+        for episode in unknown:
+            task.reset(np.arange(20))
+            seen = task.observe()
+            told = seen[:, where].argmax(axis=1)
+            episode[:] = seen[:, untold_column(CONFIG)] == 1.0
+            assert (told == np.where(episode, SEMANTIC.index("unknown"), names)).all()
         task.close()
-        assert np.flatnonzero(told == SEMANTIC.index("unknown")).tolist() == unknown
-        assert (told[:16] == np.tile([SEMANTIC.index("tilt"), SEMANTIC.index("rough")], 8)).all()
+        if training:
+            of_tilt, of_rough = unknown[:, ::2].mean(), unknown[:, 1::2].mean()
+            assert 0.1 < of_tilt < 0.3 and 0.1 < of_rough < 0.3
+            assert 0 < unknown[1].sum() < 20 and (unknown[0] != unknown[1]).any()
+        else:
+            assert not unknown.any()
+    assert untold_column(dataclasses.replace(CONFIG, cues="geometric")) is None
 
 
 def test_goal_is_seen_in_the_heading_frame(task):

@@ -10,7 +10,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from tdgc import policies
-from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, gait_entropy
+from tdgc.learn.recurrent import (
+    FastRecurrentPolicy,
+    FastRecurrentPPO,
+    GaitNoise,
+    MemoryExchange,
+    exchange_memories,
+    gait_entropy,
+)
 from tdgc.policies import Mirror
 from tdgc.sim.commands import CommandDecoder
 
@@ -144,6 +151,57 @@ def test_rollouts_are_evaluated_as_they_were_collected():
         )
         assert (values.flatten() - batch.old_values).abs().max() < 2e-6
         assert (log_prob - batch.old_log_prob).abs().max() < 1e-5
+
+
+def memories(robots: int) -> RNNStates:
+    """Each state of robot i is i, i + 0.25, i + 0.5 or i + 0.75 throughout."""
+    whose = th.arange(robots).view(1, -1, 1).expand(1, robots, HIDDEN)
+    h_pi, c_pi, h_vf, c_vf = (whose + part for part in (0.0, 0.25, 0.5, 0.75))
+    return RNNStates((h_pi, c_pi), (h_vf, c_vf))
+
+
+@pytest.mark.parametrize("untold", [None, 2])
+def test_memories_are_exchanged_among_robots_that_are_told_nothing(untold):
+    """Whole ones, none is lost, and the expected number: half of those taking part, less those
+    who get their own back, of which there is one in every shuffle on average."""
+    robots, rounds = 40, 200
+    seen = np.zeros((robots, OBS), dtype=np.float32)
+    seen[24:, 2] = 1.0
+    taking_part = np.arange(robots) if untold is None else np.arange(24, robots)
+    np.random.seed(1)
+    moved = 0
+    for _ in range(rounds):
+        states = memories(robots)
+        exchange_memories(states, seen, MemoryExchange(0.5, untold))
+        owner = states.pi[0][0, :, 0]
+        for part, state in enumerate((*states.pi, *states.vf)):
+            assert (state[0] == owner[:, None] + 0.25 * part).all()
+        assert sorted(owner.tolist()) == list(range(robots))
+        others = np.flatnonzero(owner.numpy() != np.arange(robots))
+        assert np.isin(others, taking_part).all()
+        moved += len(others)
+    assert moved / rounds == pytest.approx(len(taking_part) / 2 - 1, abs=1.0)
+
+
+def test_an_exchange_comes_after_a_rollout_and_changes_none():
+    """The next rollout begins from what was exchanged, and this one is learned as collected."""
+    model = make_model(FastRecurrentPolicy, learning_rate=0.0, exchange=MemoryExchange(1.0))
+    collected = []
+
+    def remember(values: dict, _) -> bool:
+        collected.append(values["lstm_states"].pi[0][0].numpy().copy())
+        return True
+
+    model.learn(2 * ENVS * STEPS, callback=remember)
+    first = model.rollout_buffer.hidden_states_pi[0, 0]
+    last = collected[STEPS - 1]  # after the first rollout
+    assert not np.array_equal(first, last)
+    assert np.array_equal(np.sort(first, axis=0), np.sort(last, axis=0))
+    for batch in model.rollout_buffer.get(24):
+        values, _, _ = model.policy.evaluate_actions(
+            batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
+        )
+        assert (values.flatten() - batch.old_values).abs().max() < 2e-6
 
 
 @pytest.mark.parametrize(

@@ -158,10 +158,8 @@ def test_a_policy_that_does_not_leap_walks_over_trenches(course) -> None:
 
 def test_who_is_not_told_of_trenches_leaps_when_it_sees_one(course) -> None:
     course = course(["gap", "gap"])
-    told = np.array([True, False])
-    course.teacher = Teacher(course.field, ["gap", "gap"], CommandRanges(), Landing(), told)
     course.field.features[1, 0] = course.field.features[0, 0]
-    course.teacher.begin(np.arange(2), course.goal)
+    course.teacher.begin(np.arange(2), course.goal, np.array([False, True]))
     lip = course.field.features[0, 0].trenches[0, 0]
     course.put(lip - SIGHT - 0.05)
     leaps, walks = course.commands()

@@ -73,6 +73,7 @@ VARIANTS: tuple[Variant, ...] = (
         ("ppo.gait_hold=5",),
     ),
     Variant("unscaled", "no step-time scaling", ("env.rewards.step_time_scaling=false",)),
+    Variant("exchange", "memories of untold robots change places", ("ppo.memory_exchange=0.5",)),
     Variant("no-teacher", "reinforcement learning alone", NO_TEACHER),
     Variant("fixed-pose", "the paper's nominal pose", low="fixed-pose"),
     Variant("uncalibrated", "low policy not calibrated", low="uncalibrated"),
@@ -81,7 +82,9 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("gp-uncalibrated", "the same, not calibrated", low="uncalibrated", policy="gp"),
     Variant("teacher", "the scripted teacher, told all", policy="teacher"),
 )
-#: With ``--no-teacher`` these stand in the place of ``no-teacher``: what helps it, each taken away.
+#: Rows for trainings with a teacher: without one, every robot is told its family.
+WITH_TEACHER = ("exchange", "no-teacher")
+#: With ``--no-teacher`` these stand in their place: what helps it, each taken away.
 HELPS: tuple[Variant, ...] = (
     Variant("gait-per-decision", "noise of the gait not held", ("ppo.gait_hold=1",)),
     Variant("gait-per-episode", "noise of the gait held for 20 s", ("ppo.gait_hold=200",)),
@@ -96,5 +99,5 @@ def variants(alone: bool) -> tuple[Variant, ...]:
     """The rows of an ablation, with a teacher or without."""
     if not alone:
         return VARIANTS
-    place = [variant.name for variant in VARIANTS].index("no-teacher")
-    return VARIANTS[:place] + HELPS + VARIANTS[place + 1 :]
+    place = [variant.name for variant in VARIANTS].index(WITH_TEACHER[0])
+    return VARIANTS[:place] + HELPS + VARIANTS[place + len(WITH_TEACHER) :]

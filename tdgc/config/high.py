@@ -67,8 +67,8 @@ class HighLevelConfig:
     # Whether it sees how fast the goal came nearer since the last decision. A leap is timed by the
     # trunk's speed, which no sensor of the robot gives (docs/experiments.md).
     closing_speed: bool = field(default=True, metadata={"before": False})
-    # Share of the robots in training that are told an unknown family, so that the probes alone have
-    # to do: tiles of several families, or of none that has a name.
+    # Share of the episodes in training whose family is told as unknown, so that the probes alone
+    # have to do: tiles of several families, or of none that has a name.
     unknown_share: Share = 0.2
     # Trenches, which are leapt to a few centimetres, take twice the robots of the others.
     families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "gap", "tilt")

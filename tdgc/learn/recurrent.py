@@ -47,6 +47,24 @@ class GaitNoise:
     hold: int = 1
 
 
+@dataclass(frozen=True)
+class MemoryExchange:
+    """Robots whose memories change places after each rollout.
+
+    A training tile is of one family throughout, so a memory that has seen pillars never meets a
+    trench, and a policy learns to expect none. With the memory of a robot on other ground it has to
+    act on what it sees.
+
+    Attributes:
+        share: of the robots that exchange theirs, drawn anew each time.
+        untold: column of the observation that is 1 where a robot is not told its family. Only such
+            robots take part: what the others are told says enough. None if nobody is told.
+    """
+
+    share: float
+    untold: int | None = None
+
+
 class FastRecurrentPolicy(RecurrentActorCriticPolicy):
     """``MlpLstmPolicy`` with a fast ``evaluate_actions``; for ``FastRecurrentPPO``.
 
@@ -221,6 +239,25 @@ def gait_entropy(mean: th.Tensor, std: th.Tensor, limit: float, gaits: int) -> t
     return -(share * share.log()).sum(1)
 
 
+def exchange_memories(
+    states: RNNStates, seen: NDArray[np.float32], exchange: MemoryExchange
+) -> None:
+    """Shuffle the memories of some robots among them, in place.
+
+    Args:
+        states: of actor and critic, each (1, M, hidden).
+        seen: (M, size), the robots' observations.
+        exchange: who takes part.
+    """
+    untold = np.arange(len(seen))
+    if exchange.untold is not None:
+        untold = np.flatnonzero(seen[:, exchange.untold] > 0.5)
+    some = untold[np.random.random(len(untold)) < exchange.share]
+    others = np.random.permutation(some)
+    for state in (*states.pi, *states.vf):
+        state[:, some] = state[:, others]
+
+
 class _Everything:
     """A mask without padding: RecurrentPPO takes the steps where ``mask > 1e-8``, all of them.
 
@@ -284,14 +321,29 @@ class FastRecurrentPPO(RecurrentPPO):
     Args:
         gait_ent_coef: weight of the gaits' entropy (``GaitNoise``) in the loss at the first step;
             it falls linearly to nothing at the last. It needs an ``ent_coef`` above 0 beside it.
+        exchange: of memories; none if None.
 
     Raises:
         ValueError: a ``batch_size`` below ``n_steps``, which holds no environment's rollout.
     """
 
-    def __init__(self, *args: Any, gait_ent_coef: float = 0.0, **kwargs: Any) -> None:
-        self.gait_ent_coef = gait_ent_coef
+    def __init__(
+        self,
+        *args: Any,
+        gait_ent_coef: float = 0.0,
+        exchange: MemoryExchange | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self.gait_ent_coef, self.exchange = gait_ent_coef, exchange
         super().__init__(*args, **kwargs)
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
+        """As ``RecurrentPPO`` has it; then memories are exchanged."""
+        complete = super().collect_rollouts(*args, **kwargs)
+        if self.exchange is not None:
+            seen = cast(NDArray[np.float32], self._last_obs)
+            exchange_memories(cast(RNNStates, self._last_lstm_states), seen, self.exchange)
+        return complete
 
     def train(self) -> None:
         """One update."""

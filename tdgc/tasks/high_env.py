@@ -143,6 +143,7 @@ class NavigationTask:
         self.goal = np.zeros((m, 2))
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._reached_at = np.full(m, -1)
+        self._untold = np.zeros(m, dtype=bool)  # of the family, in this episode
         self._next_push = np.zeros(m)
         disturbed = config.randomisation, self.rng, self.step_seconds
         self._pushes = Pushes(*disturbed, self._next_push)
@@ -151,9 +152,8 @@ class NavigationTask:
         self.stats = Sums()
         self.teacher = None
         if taught:
-            told = self.family_index != SEMANTIC.index("unknown")
             assert config.commands is not None  # ``paired`` has set them
-            self.teacher = Teacher(self.field, self._families, config.commands, landing, told)
+            self.teacher = Teacher(self.field, self._families, config.commands, landing)
         self._lead, self._decisions = led, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
@@ -186,6 +186,7 @@ class NavigationTask:
             width = self._width()[index]
             self.locomotion.randomise(index, self.config.randomisation, rng, width)
             self._pushes.schedule(index, self.elapsed)
+            self._untold[index] = rng.uniform(size=n) < self.config.unknown_share
         self._actions[:, index] = 0.0
         middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
         self._commands[:, index] = command_share(middle, self.decoder)
@@ -195,7 +196,7 @@ class NavigationTask:
         self._probes.begin(index)
         self._approach.begin(index, self.goal)
         if self.teacher is not None:
-            self.teacher.begin(index, self.goal)
+            self.teacher.begin(index, self.goal, self._untold)
             share = 1.0 - self._decisions[0] / self._lead if self._lead else 0.0
             self._led[index] = rng.uniform(size=n) < share
 
@@ -299,11 +300,7 @@ class NavigationTask:
         """Index into ``SEMANTIC`` of the family that each robot is told, (M,)."""
         unknown = SEMANTIC.index("unknown")
         told = np.array([SEMANTIC.index(n) if n in SEMANTIC else unknown for n in self._families])
-        if self.training:  # the last robots of each family are not told
-            each = self.num_robots / len(self.config.families)
-            place = np.arange(self.num_robots) // len(self.config.families)
-            told[place >= each * (1.0 - self.config.unknown_share)] = unknown
-        return told
+        return np.where(self._untold, unknown, told)
 
     # ------------------------------------------------------------------ statistics, resume
 
@@ -349,6 +346,7 @@ class NavigationTask:
             "actions": self._actions,
             "commands": self._commands,
             "led": self._led,
+            "untold": self._untold,
             "probes": self._probes.measured,
             "late": self._probes.late,
             "goal_distance": self._approach.distance,
@@ -391,7 +389,7 @@ class NavigationTask:
         self.locomotion.world.upload_terrain()
         self.locomotion.load_state_dict(episodes["locomotion"])
         if self.teacher is not None:
-            self.teacher.begin(np.arange(self.num_robots), self.goal)
+            self.teacher.begin(np.arange(self.num_robots), self.goal, self._untold)
             self.teacher.speed[:] = episodes["speed"]
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from tdgc.config import CommandRanges, ConfigError, HighLevelConfig
 from tdgc.policies import Mirror
 from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS
 from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
-from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, in_place, mirror, width
+from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, columns, in_place, mirror, width
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import FAMILIES
 from tdgc.tasks.leaps import FREQUENCIES
@@ -88,6 +88,12 @@ def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
     age = (_AGE,) if config.probe_age and config.cues in ("both", "geometric") else ()
     closing = (_CLOSING,) if config.closing_speed else ()
     return (*_LAYOUT, *clock, *cues, *age, *closing)
+
+
+def untold_column(config: HighLevelConfig) -> int | None:
+    """Where o^H is 1 if the family is unknown; None without the semantic cue."""
+    family = columns(high_layout(config)).get("family")
+    return None if family is None else family.start + SEMANTIC.index("unknown")
 
 
 def high_spaces(

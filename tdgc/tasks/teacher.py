@@ -151,8 +151,6 @@ class Teacher:
         families: of the robots, (M,) names.
         ranges: of the commands that their low policy was trained on.
         landing: of the low policy; None for one that does not leap, which walks over trenches.
-        told: (M,) whether a robot's high policy is told its family, by default all of them. One
-            that is not sees flat ground at first, like any other, and leaps when it sees a trench.
 
     Attributes:
         speed: (M,) m/s ahead, as leaps should have it by now and as it was seen.
@@ -166,10 +164,8 @@ class Teacher:
         families: Sequence[str],
         ranges: CommandRanges,
         landing: Landing | None,
-        told: NDArray[np.bool_] | None = None,
     ) -> None:
         m = len(families)
-        self._told = np.ones(m, dtype=bool) if told is None else told
         self._field, self._ranges, self._landing = field, ranges, landing
         self._origin = field.origin(np.arange(m), 0)
         self._leaps = np.array([family == "gap" and landing is not None for family in families])
@@ -195,8 +191,17 @@ class Teacher:
         self._end = np.full(m, -np.inf)  # m, x where a robot has no more to leap over
         self._fields: dict[int, tuple[Array, float, float]] = {}
 
-    def begin(self, index: NDArray[np.integer], goal: Array) -> None:
-        """Look at the tiles of the robots ``index`` (n,); ``goal`` (M, 2) m in the world."""
+    def begin(
+        self, index: NDArray[np.integer], goal: Array, untold: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Look at the tiles of the robots ``index`` (n,).
+
+        Args:
+            index: of the robots.
+            goal: (M, 2) m in the world.
+            untold: (M,) whose high policy is not told its family; nobody's if None. Such a robot
+                sees flat ground at first, like any other, and leaps when it sees a trench.
+        """
         width = self._field.heights.shape[1]
         self.speed[index] = 0.0
         slopes = [self._field.features[int(i), 0].slope for i in index]
@@ -205,7 +210,8 @@ class Teacher:
             trenches = self._field.features[int(i), 0].trenches
             assert self._landing is not None  # or nobody leaps
             self._plan.look(int(i), trenches, self._landing.spread)
-            self._start[i] = -np.inf if self._told[i] else trenches[0, 0] - SIGHT
+            blind = untold is not None and untold[i]
+            self._start[i] = trenches[0, 0] - SIGHT if blind else -np.inf
             self._end[i] = trenches[-1, 1] + BEYOND
         for i in index[self._pillars[index]]:
             pillars, target = self._field.features[int(i), 0].pillars, goal[i] - self._origin[i]
