@@ -429,15 +429,24 @@ def test_rooms_are_in_order() -> None:
     assert not [door for door in DOORS if f"`tdgc.{door}`" not in TEXT["CONTRIBUTING.md"]]
 
 
+def anchors(text: str) -> set[str]:
+    """What GitHub lets links to a page's headings end in."""
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("name", TEXT)
 def test_what_is_named_is_there(name: str) -> None:
     text, folder = TEXT[name], ROOT if (ROOT / name).is_file() else ROOT / "docs"
     paths = re.findall(r"(?:tdgc|docs|tests|urdf|\.ci)/[\w/.-]*\w", text)
     made = ("tdgc/LowLevel-v0", "tdgc/Navigation-v0", "docs/robot.gif")
-    links = [link.partition("#")[0] for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text)]
+    places = [link.split("#") for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text)]
+    links = [place[0] for place in places]
     missing = [p for p in paths if p not in made and not (ROOT / p).exists()]
     missing = [p for p in missing if not (ROOT / f"{p}.json").is_file()]  # a policy, no suffix
     missing += [p for p in links if p and p not in made and not (folder / p).exists()]
+    headings = [(Path(p or name).name, *anchor) for p, *anchor in places if anchor]
+    missing += [f"{page}#{a}" for page, a in headings if a not in anchors(TEXT[page])]
     assert not missing
 
 
