@@ -36,6 +36,7 @@ def tile(family: str, difficulty: float, seed: int = 0) -> Tile:
         ("stair", 0.03, 0.15, 0.174),
         ("gap", 0.05, 0.30, 0.35),
         ("tilt", 0.0, 0.45, 0.54),
+        ("clutter", 0.02, 0.15, 0.176),
     ],
 )
 def test_difficulty_parameter_is_affine(family, at_0, at_1, at_12):
@@ -157,9 +158,11 @@ def test_bad_difficulty_names_the_range(difficulty):
 
 
 def test_bad_family_names_the_families():
-    with pytest.raises(ValueError, match=r"'stairs'; choose from rough, .*, mixed, FILE\.npy$"):
+    with pytest.raises(ValueError, match=r"'stairs'; choose from rough, .*, clutter, FILE\.npy$"):
         tile("stairs", 0.5)
-    with pytest.raises(ValueError, match=r"'mixed' has no parameter; choose from rough, .*, tilt$"):
+    with pytest.raises(
+        ValueError, match=r"'mixed' has no parameter; choose from rough, .*, clutter$"
+    ):
         difficulty_parameter("mixed", 0.5)
 
 
@@ -210,7 +213,9 @@ def test_pillar_count_and_height(difficulty, count):
 
 def test_pillars_keep_clear_and_inside():
     for seed in range(40):
-        x, y, d = terrain.place_pillars(terrain.WHOLE_ZONE, 28, np.random.default_rng(seed)).T
+        x, y, d = terrain.place(
+            terrain.WHOLE_ZONE, 28, terrain.PILLAR_DIAMETER, np.random.default_rng(seed)
+        ).T
         assert len(x) == 28
         assert d.min() >= 0.2 and d.max() <= 0.4 and np.ptp(d) > 0.1
         assert (x - d / 2).min() >= 1.5 and (x + d / 2).max() <= 6.5
@@ -221,8 +226,36 @@ def test_pillars_keep_clear_and_inside():
 
 def test_pillars_that_cannot_fit_raise():
     narrow = terrain.Section(1.5, 1.5, 2.0, 2.0)
-    with pytest.raises(RuntimeError, match=r"no room for 28 pillars"):
-        terrain.place_pillars(narrow, 28, np.random.default_rng(0))
+    with pytest.raises(RuntimeError, match=r"no room for 28 cylinders"):
+        terrain.place(narrow, 28, terrain.PILLAR_DIAMETER, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("difficulty", "step"), [(0, 0.02), (0.5, 0.085), (1, 0.15)])
+def test_clutter_has_low_steps_and_things_to_walk_around(difficulty, step):
+    kinds = set()
+    for seed in range(60):
+        made = tile("clutter", difficulty, seed)
+        ground = made.support.astype(float)
+        rises = np.concatenate([np.diff(ground, axis=0).ravel(), np.diff(ground, axis=1).ravel()])
+        assert np.abs(rises).max() <= step + 0.05 * 3.0 * step + 1e-6  # and a cell of slope
+        x, y, d = made.features.pillars.T
+        obstacle = made.heights != made.support
+        assert set(np.unique(made.heights[obstacle])) <= {np.float32(0.8), np.float32(-0.6)}
+        ix, iy = np.nonzero(obstacle)
+        away = np.hypot(0.05 * ix[:, None] - x, 0.05 * iy[:, None] - y) - d / 2
+        assert (away.min(axis=1) <= 1e-9).all() if ix.size else len(x) == 0
+        kinds.update(np.unique(made.heights[obstacle]).tolist() or ["none"])
+    assert kinds == {"none", *np.float32([0.8, -0.6]).tolist()}  # posts and walls, pits
+
+
+def test_ways_through_clutter_are_as_wide_as_between_pillars():
+    for seed in range(40):
+        x, y, d = tile("clutter", 1, seed).features.pillars.T
+        away = np.hypot(x[:, None] - x, y[:, None] - y) - (d[:, None] + d) / 2
+        joined = away < 0.0  # neighbours in a wall
+        for _ in range(12):
+            joined = (joined.astype(int) @ joined) > 0
+        assert away[~joined].min(initial=np.inf) >= 0.6 - 1e-9
 
 
 @pytest.mark.parametrize(("difficulty", "step"), [(0, 0.03), (0.5, 0.09), (1, 0.15), (1.2, 0.174)])

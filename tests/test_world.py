@@ -203,11 +203,11 @@ def test_a_thousand_redraws_leak_nothing() -> None:
     world = World(1, ROBOT, PHYSICS, field)
     drawn = [make_tile(family, 1.0, np.random.default_rng(0)) for family in ALL_FAMILIES]
     for k in range(20):
-        field.place(0, 0, drawn[k % 6])
+        field.place(0, 0, drawn[k % len(drawn)])
         world.upload_terrain()
     before = resident()
     for k in range(1000):
-        field.place(0, 0, drawn[k % 6])
+        field.place(0, 0, drawn[k % len(drawn)])
         world.upload_terrain()
     assert resident() - before < 20.0
     assert_rays_hit_the_field(world, 4)

@@ -29,6 +29,7 @@ from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
 from tdgc.files import atomic
 from tdgc.parallel.cores import Workers
+from tdgc.sim.terrain import CLUTTER
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import OUTCOMES
 
@@ -164,9 +165,10 @@ class Runner:
     def evaluation_flags(self, policy: str, low: Path, high: Path | None) -> list[object]:
         """The flags of evaluate.py: of all variants the same tiles."""
         env = with_overrides(HighTrainConfig(), self.settings).env
+        families = dict.fromkeys(name for name in env.families if name != CLUTTER)
         flags: list[object] = [
             *("--policies", policy, "--levels", self.levels, "--episodes", self.episodes),
-            *("--families", ",".join(dict.fromkeys(env.families))),
+            *("--families", ",".join(families or (CLUTTER,))),
             *("--low", low, "--workers", self.workers),
         ]
         return flags if high is None else [*flags, "--high", high]

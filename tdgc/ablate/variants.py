@@ -37,6 +37,7 @@ def _discounts(seconds: float) -> tuple[str, ...]:
 
 
 _VELOCITIES = "env.behaviour=velocities"
+_CLUTTER = 'env.families=["rough","pillar","stair","gap","gap","tilt","clutter"]'
 
 #: The rows, in order.
 VARIANTS: tuple[Variant, ...] = (
@@ -73,6 +74,7 @@ VARIANTS: tuple[Variant, ...] = (
         ("ppo.gait_hold=5",),
     ),
     Variant("unscaled", "no step-time scaling", ("env.rewards.step_time_scaling=false",)),
+    Variant("clutter", "trained on clutter too", (_CLUTTER,)),
     Variant("exchange", "memories of untold robots change places", ("ppo.memory_exchange=0.5",)),
     Variant("no-teacher", "reinforcement learning alone", NO_TEACHER),
     Variant("fixed-pose", "the paper's nominal pose", low="fixed-pose"),

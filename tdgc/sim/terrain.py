@@ -32,7 +32,9 @@ EDITION = 2
 
 # Families and levels: Sec. III-A; Mixed and the levels past 10 are only ever evaluated on.
 FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
-ALL_FAMILIES = (*FAMILIES, "mixed")
+#: A family for training that is not of the benchmark: ground of many kinds that has no name.
+CLUTTER = "clutter"
+ALL_FAMILIES = (*FAMILIES, "mixed", CLUTTER)
 #: A family whose name ends so is a file with heights of the user's own, see ``height_map``.
 MAP_ENDING = ".npy"
 MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1
@@ -59,6 +61,7 @@ PARAMETER_RANGES: dict[str, tuple[float, float]] = {
     "stair": (0.03, 0.15),  # step height h_s, m
     "gap": (0.05, 0.30),  # mean gap width w, m
     "tilt": (0.0, 0.45),  # lateral slope angle theta, rad
+    CLUTTER: (0.02, 0.15),  # greatest step height, m; Stair's at d = 1
 }
 
 # What layouts are drawn from, the same at every difficulty (same table).
@@ -73,6 +76,20 @@ PILLAR_DIAMETER = (0.2, 0.4)  # m
 PILLAR_HEIGHT = 0.8  # m
 PILLAR_CLEARANCE = 0.6  # m, free way between any two
 
+# Clutter, which is ours: wide enough to hold what robots of this size may meet, and with free ways
+# as wide as between pillars.
+WAVES = 3  # plane waves that its hills add up from
+WAVE_LENGTH = (1.0, 3.0)  # m
+WAVE_SLOPE = 3.0  # 1/m, times the step height: the steepest slope, 0.45 at d = 1
+PAVING = (0.2, 0.5)  # m, sides of its paving stones
+SLABS = 60  # most slabs and bars
+SLAB_SIDE = (0.1, 1.0)  # m
+OBSTACLE_DIAMETER = (0.2, 0.6)  # m, posts and pits
+OBSTACLES = (4, 14)  # fewest and most of them
+WALL_LENGTH = (0.4, 1.2)  # m
+WALLS = (2, 6)
+WALL_THICKNESS = 0.2  # m
+
 # Bullet keeps the height range of a field's first upload, so it is pinned to what any tile can
 # need: Tilt at level 12 reaches W/2 tan(0.54 rad) = 2.40 m either way, everything else less.
 HEIGHT_RANGE = (-2.5, 2.5)  # m
@@ -85,6 +102,8 @@ TRAIN_STREAM = 1
 EVAL_STREAM = 2
 
 _X = np.arange(TILE_SAMPLES) / round(1 / CELL)  # m; i / 20 is exact wherever i * 0.05 may not be
+_PLANE: FloatArray = np.stack(np.meshgrid(_X, _X, indexing="ij"))  # (2, 161, 161) m, x and y
+_TURN = (0.0, 2.0 * math.pi)  # rad
 
 
 class Section(NamedTuple):
@@ -117,7 +136,8 @@ class Features:
         trenches: (k, 2) m, x of both lips of each trench, where its walls meet the ground.
         risers: (k, 2) m, x of the middle of each riser, and how far the ground rises there (down is
             negative).
-        pillars: (k, 3) m, x and y of the axis of each cylinder, and its diameter.
+        pillars: (k, 3) m, x and y of the axis of each cylinder, and its diameter. In Clutter they
+            stand for whatever has to be walked around.
         slope: rad, lateral: positive where the ground rises to the left.
     """
 
@@ -186,8 +206,9 @@ def difficulty_parameter(family: str, difficulty: float) -> float:
     Raises:
         ValueError: a family without a parameter, or a difficulty outside [0, 1.2].
     """
-    if family not in FAMILIES:
-        raise ValueError(f"{family!r} has no parameter; choose from {', '.join(FAMILIES)}")
+    if family not in PARAMETER_RANGES:
+        allowed = ", ".join(PARAMETER_RANGES)
+        raise ValueError(f"{family!r} has no parameter; choose from {allowed}")
     _check_difficulty(difficulty)
     p_min, p_max = PARAMETER_RANGES[family]
     return p_min + difficulty * (p_max - p_min)
@@ -232,14 +253,12 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
     features = Features()
     for part, section in zip(parts, sections, strict=True):
         if is_map(part):
-            relief = difficulty * _blend(section, BAND)[:, None] * height_map(part)
+            relief = Relief(difficulty * _blend(section, BAND)[:, None] * height_map(part))
         else:
-            parameter = difficulty_parameter(part, difficulty)
-            relief, found = _SURFACES[part](section, parameter, rng)
-            features += found
-        heights += relief
-        if part not in _ON_FLAT_BASE:
-            support += relief
+            relief = _SURFACES[part](section, difficulty_parameter(part, difficulty), rng)
+        heights += relief.heights
+        support += relief.heights if relief.support is None else relief.support
+        features += relief.features
     return Tile(
         heights.astype(np.float32),
         support.astype(np.float32),
@@ -252,9 +271,24 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
     )
 
 
-# One function per family: (section, p(d), rng) -> relief in m, broadcastable to (161, 161) and
-# zero outside the section, so that sections add up to a tile; and what the relief consists of.
-Relief = tuple[FloatArray, Features]
+class Relief(NamedTuple):
+    """What a family adds to the flat tile within its section; sections add up to a tile.
+
+    Attributes:
+        heights: m, broadcastable to (161, 161) and zero outside the section.
+        features: what they consist of.
+        support: m, likewise, the ground that the fall rule measures from; ``heights`` if None.
+    """
+
+    heights: FloatArray
+    features: Features = Features()
+    support: FloatArray | None = None
+
+
+_NO_GROUND = np.zeros((1, 1))  # what stands on the flat base or is cut into it is no ground
+
+
+# One function per family: (section, p(d), rng) -> Relief.
 
 
 def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relief:
@@ -269,7 +303,7 @@ def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relie
     noise -= noise[core].mean()
     noise /= np.abs(noise[core]).max()
     # Higher peaks are possible where the noise is still blended in.
-    return amplitude * blend[:, None] * np.clip(noise, -1.0, 1.0), Features()
+    return Relief(amplitude * blend[:, None] * np.clip(noise, -1.0, 1.0))
 
 
 def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
@@ -277,11 +311,11 @@ def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
 
     A sample within a cylinder's radius is raised, so a wall leans outwards over one cell.
     """
-    pillars = place_pillars(section, round(count * _share(section)), rng)
+    pillars = place(section, round(count * _share(section)), PILLAR_DIAMETER, rng)
     relief = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
     for cx, cy, d in pillars:
         relief[(_X[:, None] - cx) ** 2 + (_X - cy) ** 2 <= (d / 2) ** 2] = PILLAR_HEIGHT
-    return relief, Features(pillars=pillars)
+    return Relief(relief, Features(pillars=pillars), _NO_GROUND)
 
 
 def stair(section: Section, step_height: float, rng: np.random.Generator) -> Relief:
@@ -307,7 +341,8 @@ def stair(section: Section, step_height: float, rng: np.random.Generator) -> Rel
     middle = (np.concatenate([first, back[::-1]]) + 0.5) * CELL
     risers = np.column_stack([middle, np.repeat([step_height, -step_height], steps)])
     # Counted in steps, so that the ground behind the stair is level to the last digit.
-    return step_height * np.cumsum(np.sign(rise))[:, None], Features(risers=risers)
+    heights = step_height * np.cumsum(np.sign(rise))[:, None]
+    return Relief(heights, Features(risers=risers))
 
 
 def gap(section: Section, width: float, rng: np.random.Generator) -> Relief:
@@ -331,14 +366,99 @@ def gap(section: Section, width: float, rng: np.random.Generator) -> Relief:
     for sample, n in zip(first, lowered, strict=True):
         relief[sample : sample + n] = -TRENCH_DEPTH
     trenches = CELL * np.column_stack([first - 1, first + lowered])
-    return relief[:, None], Features(trenches=trenches)
+    return Relief(relief[:, None], Features(trenches=trenches), _NO_GROUND)
 
 
 def tilt(section: Section, angle: float, rng: np.random.Generator) -> Relief:
     """h = +-(y - W/2) tan(theta), either side as likely, blended in and out."""
     slope = float(rng.choice([-1.0, 1.0])) * angle
     relief = _blend(section, TILT_BAND)[:, None] * (_X - TILE_SIZE / 2) * math.tan(slope)
-    return relief, Features(slope=slope)
+    return Relief(relief, Features(slope=slope))
+
+
+def clutter(section: Section, step: float, rng: np.random.Generator) -> Relief:
+    """Flat ground, hills or paving, with slabs to step on and posts, pits or walls to walk around.
+
+    No step is higher than ``step``, but for those of hills, whose slope adds to it. The kinds of
+    ground and of obstacles are drawn for each tile, so no two are much alike.
+    """
+    kind = rng.choice(["flat", "hills", "paving"])
+    if kind == "paving":
+        ground = _paving(step, rng)
+    else:
+        ground = _hills(WAVE_SLOPE * step, rng) if kind == "hills" else np.zeros_like(_PLANE[0])
+    ground *= _blend(section, BAND)[:, None]
+    inside = (section.begin <= _X) & (section.end >= _X)
+    if kind != "paving":  # on which slabs would add steps to its own
+        ground = np.where(inside[:, None], _with_slabs(ground, section, step, rng), ground)
+    obstacles = str(rng.choice(["none", "posts", "pits", "walls"]))
+    circles = np.empty((0, 3))
+    if obstacles == "walls":
+        count = int(rng.integers(WALLS[0], WALLS[1] + 1))
+        circles = _walls(place(section, count, WALL_LENGTH, rng), rng)
+    elif obstacles != "none":
+        count = int(rng.integers(OBSTACLES[0], OBSTACLES[1] + 1))
+        circles = place(section, count, OBSTACLE_DIAMETER, rng)
+    heights = ground.copy()
+    for cx, cy, d in circles:
+        within = (_PLANE[0] - cx) ** 2 + (_PLANE[1] - cy) ** 2 <= (d / 2) ** 2
+        heights[within] = -TRENCH_DEPTH if obstacles == "pits" else PILLAR_HEIGHT
+    return Relief(heights, Features(pillars=circles), ground)
+
+
+def _hills(slope: float, rng: np.random.Generator) -> FloatArray:
+    """Plane waves in all directions, nowhere steeper than ``slope``, (161, 161) m."""
+    heights = np.zeros_like(_PLANE[0])
+    low, high = np.array([WAVE_LENGTH, _TURN, _TURN]).T
+    for length, turn, phase in rng.uniform(low, high, (WAVES, 3)):
+        number = 2.0 * math.pi / length
+        along = _PLANE[0] * np.cos(turn) + _PLANE[1] * np.sin(turn)
+        heights += slope / (WAVES * number) * np.sin(number * along + phase)
+    return heights
+
+
+def _paving(step: float, rng: np.random.Generator) -> FloatArray:
+    """Stones of one size, turned, each at a height of its own, (161, 161) m."""
+    turn, side = rng.uniform(*_TURN), rng.uniform(*PAVING, 2)
+    stones = step * rng.uniform(-0.5, 0.5, (128, 128))  # more than lie on a tile
+    u, v = _turned(_PLANE - TILE_SIZE / 2, turn)
+    row, col = np.floor(u / side[0]).astype(int), np.floor(v / side[1]).astype(int)
+    return np.asarray(stones[row, col])  # from the other end where negative
+
+
+def _with_slabs(
+    ground: FloatArray, section: Section, step: float, rng: np.random.Generator
+) -> FloatArray:
+    """Ground with slabs and bars on it, each up to ``step`` thick; none lies on another."""
+    heights = ground.copy()
+    for _ in range(rng.integers(SLABS + 1)):
+        centre = rng.uniform([section.begin, 0.0], [section.end, TILE_SIZE])
+        turn, half = rng.uniform(*_TURN), 0.5 * rng.uniform(*SLAB_SIDE, 2)
+        u, v = _turned(_PLANE - centre[:, None, None], turn)
+        covered = (np.abs(u) <= half[0]) & (np.abs(v) <= half[1])
+        thick = step * rng.uniform(0.3, 1.0)
+        heights[covered] = np.maximum(heights, ground + thick)[covered]
+    return heights
+
+
+def _turned(points: FloatArray, turn: float) -> tuple[FloatArray, FloatArray]:
+    """Coordinates of ``points`` (2, ...) along axes that are turned by ``turn`` rad."""
+    x, y = points
+    cosine, sine = math.cos(turn), math.sin(turn)
+    return x * cosine + y * sine, y * cosine - x * sine
+
+
+def _walls(placed: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Walls turned at random as rows of cylinders, (k, 3) m, from their middles and lengths
+    ``placed`` (n, 3) m."""
+    rows = [np.empty((0, 3))]
+    for cx, cy, length in placed:
+        reach = 0.5 * max(length - WALL_THICKNESS, 0.0)
+        along = np.linspace(-reach, reach, 1 + math.ceil(2.0 * reach / (0.5 * WALL_THICKNESS)))
+        turn = rng.uniform(*_TURN)
+        x, y = cx + along * np.cos(turn), cy + along * np.sin(turn)
+        rows.append(np.column_stack([x, y, np.full_like(x, WALL_THICKNESS)]))
+    return np.vstack(rows)
 
 
 def _share(section: Section) -> float:
@@ -384,7 +504,9 @@ def file_label(family: str) -> str:
     return re.sub(r"[^\w.-]", "-", family)
 
 
-def place_pillars(section: Section, count: int, rng: np.random.Generator) -> FloatArray:
+def place(
+    section: Section, count: int, diameters: tuple[float, float], rng: np.random.Generator
+) -> FloatArray:
     """Centres and diameters (count, 3) in m of cylinders that keep their clearance.
 
     One after the other at random among free places. If one finds none, all start over: even
@@ -396,7 +518,7 @@ def place_pillars(section: Section, count: int, rng: np.random.Generator) -> Flo
     restarts, candidates = 100, 256  # ample: at level 12 one tile in 25 restarts, easier ones fewer
     for _ in range(restarts):
         placed = np.empty((0, 3))
-        for d in rng.uniform(*PILLAR_DIAMETER, count):
+        for d in rng.uniform(*diameters, count):
             x = rng.uniform(section.begin + d / 2, section.end - d / 2, candidates)
             y = rng.uniform(d / 2, TILE_SIZE - d / 2, candidates)
             distance = np.hypot(x[:, None] - placed[:, 0], y[:, None] - placed[:, 1])
@@ -407,7 +529,9 @@ def place_pillars(section: Section, count: int, rng: np.random.Generator) -> Flo
             placed = np.vstack([placed, (x[pick], y[pick], d)])
         else:
             return placed
-    raise RuntimeError(f"no room for {count} pillars between x = {section.begin} and {section.end}")
+    raise RuntimeError(
+        f"no room for {count} cylinders between x = {section.begin} and {section.end}"
+    )
 
 
 _SURFACES: dict[str, Callable[[Section, float, np.random.Generator], Relief]] = {
@@ -416,9 +540,8 @@ _SURFACES: dict[str, Callable[[Section, float, np.random.Generator], Relief]] = 
     "stair": stair,
     "gap": gap,
     "tilt": tilt,
+    CLUTTER: clutter,
 }
-# Their relief is not ground: the fall rule measures from the flat base (TDGC-Bench, "Episode").
-_ON_FLAT_BASE = ("pillar", "gap")
 
 
 def tile_rng(

@@ -1,12 +1,13 @@
 """A scripted expert on each training family, which the high policy first imitates.
 
 It is told what the high policy has to find out from its cues: where on the tile the robot is and
-how fast, the way around the pillars, the lines of the trenches. How a family wants to be walked was
+how fast, the way around pillars, the lines of the trenches. How a family wants to be walked was
 tried on training tiles (docs/experiments.md). Leaps over trenches show why imitation comes first:
 pronk at nearly full speed, its steps timed to a few centimetres, is nothing that exploring from a
 trot finds.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,7 +18,7 @@ from tdgc.config import CommandRanges
 from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
-from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
+from tdgc.sim.terrain import CELL, CLUTTER, TILE_SAMPLES, TILE_SIZE, TileField
 from tdgc.tasks.leaps import (
     BEYOND,
     FREQUENCIES,
@@ -78,11 +79,13 @@ UNEVEN = Style(
 #: A family's style. Numbers beside the defaults of Walk These Ways are from docs/experiments.md.
 STYLES = {
     "rough": UNEVEN,
-    "pillar": Style(0.5),
+    # Slower, but no lower: what looks like a pillar from afar may be a step on ground never met.
+    "pillar": dataclasses.replace(UNEVEN, speed=0.5),
     "stair": UNEVEN,
     # in pronk, see ``tdgc.tasks.leaps``
     "gap": Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1),
     "tilt": Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45),
+    CLUTTER: UNEVEN,
 }
 
 #: m ahead that the probes see a trench; they reach 1.05 m.
@@ -169,7 +172,7 @@ class Teacher:
         self._field, self._ranges, self._landing = field, ranges, landing
         self._origin = field.origin(np.arange(m), 0)
         self._leaps = np.array([family == "gap" and landing is not None for family in families])
-        self._pillars = np.array([family == "pillar" for family in families])
+        self._detours = np.array([family in ("pillar", CLUTTER) for family in families])
         styles = [
             UNEVEN if family == "gap" and landing is None else STYLES.get(family, UNEVEN)
             for family in families
@@ -213,7 +216,7 @@ class Teacher:
             blind = untold is not None and untold[i]
             self._start[i] = trenches[0, 0] - SIGHT if blind else -np.inf
             self._end[i] = trenches[-1, 1] + BEYOND
-        for i in index[self._pillars[index]]:
+        for i in index[self._detours[index]]:
             pillars, target = self._field.features[int(i), 0].pillars, goal[i] - self._origin[i]
             self._fields[int(i)] = travel_cost(pillars, width, self._field.crop, target)
 
@@ -237,9 +240,9 @@ class Teacher:
         command = np.where(blind[:, None], self._uneven, self._command)
         top_speed = np.where(blind, UNEVEN.speed, self._top_speed)
         speed, turn = toward(distance, error, top_speed, turns=self._ranges.yaw_rate)
-        # Between pillars any way it faces: backward, too, off one that it leans on.
-        any_way = np.where(self._pillars, np.minimum(top_speed, distance), 0.0)
-        speed = np.where(self._pillars, any_way * np.cos(error), speed)
+        # Around obstacles any way it faces: backward, too, off one that it leans on.
+        any_way = np.where(self._detours, np.minimum(top_speed, distance), 0.0)
+        speed = np.where(self._detours, any_way * np.cos(error), speed)
         command[:, INDEX["vx"]] = speed + self._climb * np.sin(state.yaw)
         command[:, INDEX["vy"]] = any_way * np.sin(error) + self._climb * np.cos(state.yaw)
         command[:, INDEX["yaw_rate"]] = turn
