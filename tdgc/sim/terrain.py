@@ -312,10 +312,16 @@ def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
     A sample within a cylinder's radius is raised, so a wall leans outwards over one cell.
     """
     pillars = place(section, round(count * _share(section)), PILLAR_DIAMETER, rng)
-    relief = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
-    for cx, cy, d in pillars:
-        relief[(_X[:, None] - cx) ** 2 + (_X - cy) ** 2 <= (d / 2) ** 2] = PILLAR_HEIGHT
+    relief = np.where(_within(pillars), PILLAR_HEIGHT, 0.0)
     return Relief(relief, Features(pillars=pillars), _NO_GROUND)
+
+
+def _within(circles: FloatArray) -> NDArray[np.bool_]:
+    """Samples (161, 161) within any of the circles (k, 3) m: x, y and diameter."""
+    covered = np.zeros((TILE_SAMPLES, TILE_SAMPLES), dtype=bool)
+    for cx, cy, d in circles:
+        covered |= (_X[:, None] - cx) ** 2 + (_X - cy) ** 2 <= (d / 2) ** 2
+    return covered
 
 
 def stair(section: Section, step_height: float, rng: np.random.Generator) -> Relief:
@@ -399,10 +405,8 @@ def clutter(section: Section, step: float, rng: np.random.Generator) -> Relief:
     elif obstacles != "none":
         count = int(rng.integers(OBSTACLES[0], OBSTACLES[1] + 1))
         circles = place(section, count, OBSTACLE_DIAMETER, rng)
-    heights = ground.copy()
-    for cx, cy, d in circles:
-        within = (_PLANE[0] - cx) ** 2 + (_PLANE[1] - cy) ** 2 <= (d / 2) ** 2
-        heights[within] = -TRENCH_DEPTH if obstacles == "pits" else PILLAR_HEIGHT
+    level = -TRENCH_DEPTH if obstacles == "pits" else PILLAR_HEIGHT
+    heights = np.where(_within(circles), level, ground)
     return Relief(heights, Features(pillars=circles), ground)
 
 
