@@ -213,5 +213,7 @@ def test_the_papers_preset_is_its_table() -> None:
     assert (ppo.gamma, ppo.gae_lambda) == (0.99, 0.95)
     assert (ppo.n_steps, ppo.n_epochs, ppo.minibatches) == (24, 5, 4)
     assert (ppo.lstm, ppo.actor, ppo.critic) == (128, (128,), (128,))
-    assert config.env.unknown_share == 0.0  # its robots are told the family
+    # Its robots are told the family, on the paper's five, and keep their memories.
+    assert (config.env.unknown_share, ppo.memory_exchange) == (0.0, 0.0)
+    assert config.env.families == ("rough", "pillar", "stair", "gap", "tilt")
     assert with_overrides(HighTrainConfig(), PRESETS["default"]) == HighTrainConfig()

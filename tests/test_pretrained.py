@@ -1,6 +1,7 @@
 """The shipped pair is what today's commands give."""
 
 import dataclasses
+import hashlib
 import itertools
 import json
 from pathlib import Path
@@ -47,7 +48,13 @@ def test_the_high_policy_was_trained_with_the_defaults() -> None:
     """On the shipped low policy."""
     _, low = load_low(PRETRAINED / "low")
     defaults = HighTrainConfig()
-    config = dataclasses.replace(defaults, env=paired(defaults.env, low), low="runs/low/policy")
+    used = PRETRAINED / "low"
+    config = dataclasses.replace(
+        defaults,
+        env=paired(defaults.env, low),
+        low="tdgc/pretrained/low",
+        low_sha256=hashlib.sha256(used.with_suffix(".json").read_bytes()).hexdigest(),
+    )
     path = PRETRAINED / "high_run" / "config.json"
     # A setting that came later has the value that the run had without it.
     assert recorded(HighTrainConfig, read(path), path) == config

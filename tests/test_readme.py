@@ -111,10 +111,6 @@ CHAINS: tuple[dict[str, Run], ...] = (
                 ("runs/export/low.pt", "runs/export/high_interface.json"),
             )
         ),
-        "python train_high.py --low runs/low/policy --set ppo.memory_exchange=0.5 "
-        "--set imitation.levels_after=hardest "
-        """--set 'env.families=["rough","pillar","stair","gap","gap","tilt","clutter"]' """
-        "--out runs/any": Run(HIGH, ("runs/any/policy.safetensors",)),
         "python train_high.py --low runs/low/policy --init runs/high/policy "
         """--set 'env.families=["rough","stair","hills.npy"]' --out runs/hills""": Run(
             HIGH, ("runs/hills/policy.safetensors",)

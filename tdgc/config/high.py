@@ -71,7 +71,8 @@ class HighLevelConfig:
     # have to do: tiles of several families, or of none that has a name.
     unknown_share: Share = 0.2
     # Trenches, which are leapt to a few centimetres, take twice the robots of the others.
-    families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "gap", "tilt")
+    # Clutter stands for ground that no other family resembles (docs/experiments.md).
+    families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "gap", "tilt", "clutter")
     levels: Count = 11  # L_max: levels 0..10
     # How levels are chosen in training: by each robot's performance, as the paper has it; drawn
     # uniformly for each episode; or always the hardest.
