@@ -46,9 +46,9 @@ def test_the_low_policy_was_trained_with_the_defaults() -> None:
 
 def test_the_high_policy_was_trained_with_the_defaults() -> None:
     """On the shipped low policy."""
-    _, low = load_low(PRETRAINED / "low")
-    defaults = HighTrainConfig()
     used = PRETRAINED / "low"
+    _, low = load_low(used)
+    defaults = HighTrainConfig()
     config = dataclasses.replace(
         defaults,
         env=paired(defaults.env, low),
