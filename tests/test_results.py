@@ -1,4 +1,4 @@
-"""Rates, their intervals, paired differences, and the files of a results folder."""
+"""Tables of rates and paired differences, and the files of a results folder."""
 
 from __future__ import annotations
 
@@ -10,15 +10,8 @@ import numpy as np
 import pytest
 
 from tdgc.benchmark.evaluation import Episode
-from tdgc.benchmark.results import (
-    FILES,
-    compare,
-    describe,
-    paired_interval,
-    summarise,
-    wilson_interval,
-    write_results,
-)
+from tdgc.benchmark.intervals import paired_interval
+from tdgc.benchmark.results import FILES, compare, describe, summarise, write_results
 
 
 def row(policy: str, family: str, level: int, episode: int, outcome: str) -> Episode:
@@ -30,35 +23,6 @@ def row(policy: str, family: str, level: int, episode: int, outcome: str) -> Epi
 def rows(policy: str, family: str, reached: list[bool]) -> list[Episode]:
     ends = ["reached" if good else "fell" for good in reached]
     return [row(policy, family, 6, k, end) for k, end in enumerate(ends)]
-
-
-def test_wilson_interval_is_the_textbook_one() -> None:
-    # Wilson's interval of 8 in 10 at 95 %: 0.4902 to 0.9433 (e.g. Newcombe 1998, method 3).
-    low, high = wilson_interval(8, 10)
-    assert low == pytest.approx(0.4902, abs=5e-5) and high == pytest.approx(0.9433, abs=5e-5)
-    assert wilson_interval(0, 20)[0] == 0.0 and wilson_interval(20, 20)[1] == 1.0
-    with pytest.raises(ValueError, match=r"0 <= reached <= n"):
-        wilson_interval(3, 2)
-
-
-def test_paired_interval_is_newcombes() -> None:
-    # Airway hyper-responsiveness before and after a transplantation, 21 patients, as Fagerland,
-    # Lydersen and Laake (2014) work it out: -0.286, from -0.507 to -0.026.
-    low, high = paired_interval(1, 1, 7, 12)
-    assert (low, high) == pytest.approx((-0.507, -0.026), abs=5e-4)
-    # The other way round, and never beyond the possible.
-    assert paired_interval(1, 7, 1, 12) == pytest.approx((-high, -low))
-    assert paired_interval(0, 20, 0, 0) == pytest.approx((0.7721, 1.0), abs=5e-5)
-    low, high = paired_interval(100, 0, 0, 0)
-    assert low == pytest.approx(-high) and 0.03 < high < 0.06
-
-
-def test_paired_interval_covers_the_truth() -> None:
-    """Of 2,000 tables of 100 tiles drawn with success of 0.95 and 0.9 that go together."""
-    rng = np.random.default_rng(0)
-    tables = rng.multinomial(100, [0.88, 0.07, 0.02, 0.03], 2000)
-    inside = [low <= 0.05 <= high for low, high in (paired_interval(*map(int, t)) for t in tables)]
-    assert 0.94 <= np.mean(inside) <= 0.98
 
 
 def test_summary_counts_and_averages() -> None:

@@ -154,6 +154,28 @@ def report(
     return described
 
 
+def conduct(
+    runner: Runner, trials: Sequence[Trial], common: dict[str, Any], tiles: Sequence[Tile]
+) -> tuple[dict[Trial, Found], bool]:
+    """Run ``trials`` one after the other, with a report after each.
+
+    Returns:
+        What those came to that were run, and whether all were: False after a signal or at the time
+        limit.
+    """
+    found: dict[Trial, Found] = {}
+    for trial in trials:
+        print(f"{trial.name}: {trial.variant.what}", flush=True)
+        try:
+            found[trial] = runner.run(trial)
+        except TrialError as error:
+            found[trial] = str(error)
+        except StoppedError:
+            return found, False
+        report(runner.out, common, tiles, trials, found)
+    return found, True
+
+
 def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     deadline = None if args.time_limit is None else time.monotonic() + args.time_limit
@@ -169,23 +191,14 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"tdgc.ablate: {error}", file=sys.stderr)
         return 2
-    trials, found, stopped = plan(chosen, seeds), dict[Trial, Found](), False
+    trials = plan(chosen, seeds)
     try:
-        for trial in trials:
-            print(f"{trial.name}: {trial.variant.what}", flush=True)
-            try:
-                found[trial] = runner.run(trial)
-            except TrialError as error:
-                found[trial] = str(error)
-            except StoppedError:
-                stopped = True
-                break
-            report(args.out, common, tiles, trials, found)
+        found, finished = conduct(runner, trials, common, tiles)
         print(report(args.out, common, tiles, trials, found))
     except OSError as error:  # what is done is in the trials' folders
         print(f"tdgc.ablate: {error}", file=sys.stderr)
         return 1
-    if stopped:
+    if not finished:
         print("stopped; the same command goes on")
     failed = {trial.name: message for trial, message in found.items() if isinstance(message, str)}
     for name, message in failed.items():

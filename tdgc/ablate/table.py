@@ -10,11 +10,10 @@ from statistics import mean
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tdgc.ablate.trials import Result, Tile, Trial
 from tdgc.ablate.variants import WHOLE
-from tdgc.benchmark.results import Z_95, paired_interval, wilson_interval
+from tdgc.benchmark.intervals import difference, rates
 
 #: What a trial came to, or the message of its error.
 Found = Result | str
@@ -32,8 +31,9 @@ def rows(
 
     Returns:
         Of each variant ``name``, ``what`` and ``errors``, seed -> message. If a trial is done also
-        ``rates`` of its seeds; ``families`` and ``seeds``, each -> rate; ``versus``: ``difference``
-        to ``full`` with the same seed; and of a training ``FACTS``, means over the seeds.
+        ``rates`` of its seeds' episodes; ``families`` and ``seeds``, each -> rate; ``versus``:
+        ``difference`` to ``full`` with the same seed; and of a training ``FACTS``, means over the
+        seeds.
     """
     of = np.array([family for family, _, _ in tiles])
     done = {trial: result for trial, result in found.items() if isinstance(result, Result)}
@@ -59,8 +59,7 @@ def rows(
             ]
             row["versus"] = None
             if pairs and variant.name != WHOLE:
-                first, second = (np.array(side) for side in zip(*pairs, strict=True))
-                row["versus"] = difference(first, second)
+                row["versus"] = difference(np.array(pairs).swapaxes(1, 2))
             facts = [result.facts for result in results.values()]
             row |= {name: mean(each[name] for each in facts) for name in facts[0]}
         row["errors"] = {str(t.seed): found[t] for t in mine if isinstance(found.get(t), str)}
@@ -68,61 +67,11 @@ def rows(
     return table
 
 
-def rates(reached: NDArray[np.bool_]) -> dict[str, float]:
-    """Of n tiles, each with whether the goal was reached with each seed, (seeds, n): how many tiles
-    (n), ``reached`` of them, the mean over the seeds, ``rate``, and its interval ci_low, ci_high.
-    """
-    seeds, n = reached.shape
-    good = int(reached.sum())
-    low, high = wilson_interval(good, reached.size, Z_95 * wider(reached))
-    return {
-        "n": n,
-        "reached": good / seeds,
-        "rate": good / reached.size,
-        "ci_low": low,
-        "ci_high": high,
-    }
-
-
-def difference(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str, float]:
-    """The same of two variants on the same tiles, (seeds, n) each: how many tiles (n), gained and
-    lost (only the first, only the second reached the goal, means over the seeds), the
-    ``difference`` of the rates and its interval ci_low, ci_high."""
-    seeds, n = first.shape
-    both, gained, lost, neither = (
-        int(tiles.sum())
-        for tiles in (first & second, first & ~second, ~first & second, ~first & ~second)
-    )
-    z = Z_95 * wider(first.astype(float) - second)
-    low, high = paired_interval(both, gained, lost, neither, z)
-    return {
-        "n": n,
-        "gained": gained / seeds,
-        "lost": lost / seeds,
-        "difference": (gained - lost) / first.size,
-        "ci_low": low,
-        "ci_high": high,
-    }
-
-
-def wider(values: NDArray[Any]) -> float:
-    """How much wider the interval of a mean over ``values`` (seeds, n) is than if every one of them
-    were of a tile of its own.
-
-    The root of the design effect of a sample in clusters, which here are the seeds on a tile: 1
-    with one seed or where a tile decides nothing, the root of the number of seeds where all of them
-    do the same.
-    """
-    spread = values.var()
-    share = values.mean(axis=0).var() / spread if spread > 0.0 else 1.0  # due to the tiles
-    return max(1.0, float(np.sqrt(len(values) * share)))
-
-
 def describe(table: Sequence[dict[str, Any]]) -> str:
     """Rows as text, with the errors below them."""
     families = list(next((row["families"] for row in table if "n" in row), {}))
     wide = max(len(row["name"]) for row in table) + 1
-    head = f"{'variant':<{wide}}{'tiles':>6}{'success':>9}{'95 %':>15}{'against full':>22}"
+    head = f"{'variant':<{wide}}{'n':>6}{'success':>9}{'95 %':>15}{'against full':>22}"
     head += "".join(f"{Path(family).stem[:8]:>9}" for family in families)
     lines = [f"{head}{'steps':>9}{'hours':>7}"]
     for row in table:

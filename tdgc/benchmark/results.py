@@ -1,9 +1,8 @@
-"""Results: episodes -> rates with their intervals, and the files of a results folder."""
+"""Results: episodes -> tables of rates, and the files of a results folder."""
 
 import contextlib
 import csv
 import json
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tdgc.benchmark.evaluation import Cell, Episode, complete
+from tdgc.benchmark.intervals import difference, rates
 from tdgc.files import atomic
 from tdgc.parallel.worker import WorkerError
 from tdgc.sim.terrain import EDITION
@@ -25,69 +25,6 @@ PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
 # The rule of dominance (TDGC-Bench): ``tdgc`` is nowhere below ``gp``. What it has over ``cues`` is
 # what learning adds to the cues.
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
-
-
-#: 95 % of a normal distribution are within so many deviations.
-Z_95 = 1.959964
-
-
-def wilson_interval(reached: int, n: int, z: float = Z_95) -> tuple[float, float]:
-    """Wilson score interval of a rate, 95 % by default (Wilson 1927)."""
-    if not 0 <= reached <= n or n < 1:
-        raise ValueError(f"need 0 <= reached <= n and n >= 1, not {reached} of {n}")
-    rate = reached / n
-    centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * np.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
-
-
-def paired_interval(
-    both: int, first: int, second: int, neither: int, z: float = Z_95
-) -> tuple[float, float]:
-    """Interval of the difference of two rates on the same tiles, the first's less the second's.
-
-    95 % by default: method 10 of Newcombe (1998, Statistics in Medicine 17, 2635-2650), which joins
-    the Wilson intervals of both rates by their correlation.
-
-    Args:
-        both, first, second, neither: number of tiles on which both succeeded, only the first, only
-            the second, neither.
-        z: quantile of the normal distribution.
-    """
-    n = both + first + second + neither
-    one, other = (both + first) / n, (both + second) / n
-    one_low, one_high = wilson_interval(both + first, n, z)
-    other_low, other_high = wilson_interval(both + second, n, z)
-    together = float(both * neither - first * second)
-    if together > 0:  # Newcombe's continuity correction
-        together = max(together - n / 2, 0.0)
-    spread = (both + first) * (second + neither) * (both + second) * (first + neither)
-    correlation = together / spread**0.5 if spread else 0.0
-
-    def half(a: float, b: float) -> float:
-        return max(a * a - 2.0 * correlation * a * b + b * b, 0.0) ** 0.5
-
-    return (
-        one - other - half(one - one_low, other_high - other),
-        one - other + half(one_high - one, other - other_low),
-    )
-
-
-def difference(tiles: Iterable[tuple[bool, bool]]) -> dict[str, float]:
-    """Of tiles, each with whether the first and the second policy reached the goal: how many (n),
-    gained and lost (only the first, only the second reached it), the ``difference`` of the rates
-    and its interval ci_low, ci_high."""
-    found = Counter(tiles)
-    n, gained, lost = found.total(), found[True, False], found[False, True]
-    low, high = paired_interval(found[True, True], gained, lost, found[False, False])
-    return {
-        "n": n,
-        "gained": gained,
-        "lost": lost,
-        "difference": (gained - lost) / n,
-        "ci_low": low,
-        "ci_high": high,
-    }
 
 
 def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, Any]:
@@ -139,18 +76,9 @@ def sides(episodes: Iterable[Episode]) -> dict[str, Any]:
     }
 
 
-def rates(reached: Iterable[bool]) -> dict[str, float]:
-    """Of episodes, each with whether it reached the goal: how many (n), reached, rate, and its
-    interval ci_low, ci_high."""
-    every = list(reached)
-    n, good = len(every), sum(every)
-    low, high = wilson_interval(good, n)
-    return {"n": n, "reached": good, "rate": good / n, "ci_low": low, "ci_high": high}
-
-
 def success(rows: Sequence[Episode]) -> dict[str, float]:
     """``rates`` of episodes."""
-    return rates(e.outcome == "reached" for e in rows)
+    return rates([e.outcome == "reached" for e in rows])
 
 
 def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:
