@@ -363,17 +363,6 @@ def test_a_feed_forward_policy_remembers_nothing_and_learns(mirror, tmp_path):
     th.testing.assert_close(run_through(other, seen, starts)[0], actions)
 
 
-def test_a_feed_forward_rollout_is_evaluated_as_it_was_collected():
-    model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=FORWARD)
-    model.learn(2 * ENVS * STEPS)
-    for batch in model.rollout_buffer.get(24):
-        values, log_prob, _ = model.policy.evaluate_actions(
-            batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
-        )
-        assert (values.flatten() - batch.old_values).abs().max() < 2e-6
-        assert (log_prob - batch.old_log_prob).abs().max() < 1e-5
-
-
 # ------------------------------------------------------------------ exploring gaits
 
 
@@ -506,8 +495,14 @@ def test_what_is_encoded_goes_past_the_memory():
     assert actions.std() > 1e-3
 
 
-def test_an_encoded_rollout_is_evaluated_as_it_was_collected():
-    model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=ENCODED)
+def test_an_encoder_needs_a_memory():
+    with pytest.raises(ValueError, match=r"^an encoder stands before LSTMs"):
+        make_model(FastRecurrentPolicy, policy_kwargs={**ENCODED, **FORWARD})
+
+
+@pytest.mark.parametrize("kind", [FORWARD, ENCODED], ids=["feed-forward", "encoded"])
+def test_a_rollout_is_evaluated_as_it_was_collected(kind):
+    model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=kind)
     model.learn(2 * ENVS * STEPS)
     for batch in model.rollout_buffer.get(24):
         values, log_prob, _ = model.policy.evaluate_actions(
@@ -515,8 +510,3 @@ def test_an_encoded_rollout_is_evaluated_as_it_was_collected():
         )
         assert (values.flatten() - batch.old_values).abs().max() < 2e-6
         assert (log_prob - batch.old_log_prob).abs().max() < 1e-5
-
-
-def test_an_encoder_needs_a_memory():
-    with pytest.raises(ValueError, match=r"^an encoder stands before LSTMs"):
-        make_model(FastRecurrentPolicy, policy_kwargs={**ENCODED, **FORWARD})
