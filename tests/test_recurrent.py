@@ -295,6 +295,15 @@ def run_through(policy, observations: np.ndarray, starts: np.ndarray) -> tuple[t
     return th.stack(actions), th.stack(values)
 
 
+def act_alike(loaded, seen: np.ndarray, starts: np.ndarray, wanted: th.Tensor):
+    """A policy from its file acts as ``run_through`` found; what it remembers in the end."""
+    state = None
+    for row, start, action in zip(seen, starts, wanted, strict=True):
+        given, state = loaded.predict(row, state, start)
+        np.testing.assert_allclose(given, action.clamp(-2.0, 2.0), atol=1e-6)
+    return state
+
+
 def test_a_mirrored_policy_is_symmetric_and_learning_keeps_it_so():
     rng = np.random.default_rng(0)
     seen = rng.normal(size=(STEPS, ENVS, OBS)).astype(np.float32)
@@ -320,10 +329,8 @@ def test_a_mirrored_policy_acts_from_its_file_as_it_was_trained(tmp_path):
     policy = make_model(FastRecurrentPolicy, policy_kwargs={"mirror": MIRROR}).policy
     wanted, _ = run_through(policy, seen, starts)
     policies.save(tmp_path / "policy", policy, {})
-    loaded, state = policies.load(tmp_path / "policy"), None
-    for row, start, action in zip(seen, starts, wanted, strict=True):
-        given, state = loaded.predict(row, state, start)
-        np.testing.assert_allclose(given, action.clamp(-2.0, 2.0), atol=1e-6)
+    loaded = policies.load(tmp_path / "policy")
+    state = act_alike(loaded, seen, starts, wanted)
     assert state[0].shape == (1, ENVS, 2 * HIDDEN)
     with pytest.raises(ValueError, match=rf"it must be two of \(1, 5, {2 * HIDDEN}\)"):
         loaded.predict(seen[0], (np.zeros((1, 5, HIDDEN)),) * 2)
@@ -469,13 +476,11 @@ def test_an_encoder_learns_and_acts_from_its_file_as_it_was_trained(mirror, tmp_
         th.testing.assert_close(mirrored, wanted * th.tensor([1.0, -1.0]))
         th.testing.assert_close(same, values)
     policies.save(tmp_path / "policy", model.policy, {})
-    loaded, state = policies.load(tmp_path / "policy"), None
+    loaded = policies.load(tmp_path / "policy")
     assert (loaded.kind, loaded.header.lstm, loaded.header.encoder) == ("lstm", HIDDEN, (7, 5))
     # The head is given 5 of the encoder after what the LSTM remembers.
     assert loaded.tensors["actor.0.weight"].shape[1] == HIDDEN + 5
-    for row, start, action in zip(seen, starts, wanted, strict=True):
-        given, state = loaded.predict(row, state, start)
-        np.testing.assert_allclose(given, action.clamp(-2.0, 2.0), atol=1e-6)
+    act_alike(loaded, seen, starts, wanted)
     other = make_model(FastRecurrentPolicy, policy_kwargs={**ENCODED, "mirror": mirror}).policy
     policies.load_into(tmp_path / "policy", other)
     th.testing.assert_close(run_through(other, seen, starts)[0], wanted)
