@@ -151,6 +151,7 @@ def make_learner(
         env,
         policy_kwargs={
             "lstm_hidden_size": ppo.lstm,
+            "encoder": ppo.encoder,
             "gait": GaitNoise(config.n_envs, len(config.env.gaits), ppo.gait_hold),
             "net_arch": {"pi": list(ppo.actor), "vf": list(ppo.critic)},
             "log_std_init": math.log(ppo.initial_std),
@@ -242,6 +243,10 @@ def check(config: HighTrainConfig) -> None:
         for name, used in (("gait_ent_coef", True), ("imitation_coef", config.imitation.steps)):
             if used and getattr(ppo, name):
                 raise ConfigError(f"'ppo.{name}' needs an 'ppo.ent_coef' above 0; or set it to 0")
+    if ppo.encoder and ppo.lstm is None:
+        raise ConfigError(
+            "'ppo.encoder' must be [] where 'ppo.lstm' is null: it stands before LSTMs"
+        )
     if ppo.mirror:
         high_mirror(env)
     start_action(config)

@@ -57,7 +57,11 @@ def shake(policy: ActorCriticPolicy) -> None:
 
 
 def random_high(
-    path: Path, config: HighLevelConfig, low: LowLevelConfig = LOW_CONFIG, hidden: int | None = 32
+    path: Path,
+    config: HighLevelConfig,
+    low: LowLevelConfig = LOW_CONFIG,
+    hidden: int | None = 32,
+    encoder: tuple[int, ...] = (),
 ) -> Path:
     """A high policy with random weights, saved as ``train_high.py`` saves one."""
     size = width(high_layout(config))
@@ -65,7 +69,8 @@ def random_high(
     mirror = high_mirror(config) if config.probes == "lines" else None
     policy = FastRecurrentPolicy(
         unbounded(size), spaces.Box(-limit, limit, (13,)), lambda _: 1e-3,
-        lstm_hidden_size=hidden, net_arch={"pi": [hidden or 8], "vf": [4]}, mirror=mirror,
+        lstm_hidden_size=hidden, encoder=encoder, net_arch={"pi": [hidden or 8], "vf": [4]},
+        mirror=mirror,
     )  # fmt: skip
     shake(policy)
     trained_on = {"config": to_dict(low), "observation": LOW_POLICY.actor_dim}
@@ -223,12 +228,14 @@ def test_low_level_is_the_executors_step(
 def test_high_level_is_the_tasks_observation_and_decoder(
     tmp_path: Path, cues: str, probes: str
 ) -> None:
-    """With a mirror, and without for probes that are not the same on both sides."""
+    """With a mirror, and without for probes that are not the same on both sides; with an encoder
+    before the LSTM where the cues are whole."""
     narrow = dataclasses.replace(HIGH_CONFIG.commands, vx=(-0.5, 0.8), pitch=(0.0, 0.0))
     config = HighLevelConfig(
         cues=cues, probes=probes, action_limit=2.0, decimation=4, commands=narrow
     )
-    policy = policies.load(random_high(tmp_path / "high", config))
+    encoder = (24, 16) if cues == "both" else ()
+    policy = policies.load(random_high(tmp_path / "high", config, encoder=encoder))
     assert policy.state_size == (64 if probes == "lines" else 32)
     graph = HighGraph(policy, config, LOW_CONFIG)
     task = NavigationTask(config, LOW, 5, seed=2, training=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from tdgc.learn.imitation import (
 from tdgc.learn.recurrent import FastRecurrentPPO
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
 from tdgc.tasks.high_observation import GUIDANCE
-from tdgc.tasks.leaps import FREQUENCIES
+from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 
 SEEN, ENVS, STEPS = 5, 4, 16
 
@@ -38,7 +40,7 @@ class Lesson(gym.Env):
         seen = self.rng.uniform(-1.0, 1.0, SEEN)
         taught = np.resize(0.5 * self.last, NUM_ACTIONS)
         self.last = seen
-        return np.concatenate([seen, taught, np.zeros(FREQUENCIES)]).astype(np.float32)
+        return np.concatenate([seen, taught, np.zeros(GUIDANCE - NUM_ACTIONS)]).astype(np.float32)
 
     def reset(self, *, seed=None, options=None):
         self.last = np.zeros(SEEN)
@@ -129,41 +131,62 @@ def test_the_teachers_actions_are_not_seen(apprentice, tmp_path) -> None:
     np.testing.assert_allclose(actions, np.clip(expected.detach().numpy(), -1, 1), atol=1e-6)
 
 
-def guidance(taught: float, price: list[float] | np.ndarray) -> th.Tensor:
-    return th.tensor([*np.full(NUM_ACTIONS, taught), *price], dtype=th.float32)[None]
+FREE = np.zeros((FREQUENCIES, LENGTHS))
+
+
+def guidance(taught: float, price: np.ndarray) -> th.Tensor:
+    return th.tensor([*np.full(NUM_ACTIONS, taught), *price.ravel()], dtype=th.float32)[None]
 
 
 def test_between_two_ways_over_a_trench_a_student_takes_one() -> None:
-    """Frequencies about -0.5 and 0.5 are free and those between them lead into the trench. The
-    teacher takes either as often; the least squares are in the trench, the least loss is not."""
-    grid = np.linspace(-1.0, 1.0, FREQUENCIES)
-    price = np.where(np.abs(np.abs(grid) - 0.5) < 0.2, 0.0, 4.0)
-    both = th.cat([guidance(-0.5, price), guidance(0.5, price)])
-    tried = th.linspace(-1.0, 1.0, 401)
+    """Short strides and long ones are free and those between them lead into the trench; so do short
+    ones with the long stance, and the other way about. The teacher takes either as often; the least
+    squares are in the trench, the least loss is not."""
+    frequency, length = np.meshgrid(
+        np.linspace(-1.0, 1.0, FREQUENCIES), np.linspace(-1.0, 1.0, LENGTHS), indexing="ij"
+    )
+    short = np.hypot(frequency + 0.5, length - 0.5) < 0.3
+    long = np.hypot(frequency - 0.5, length + 0.5) < 0.3
+    price = np.where(short | long, 0.0, 4.0)
+    tried = np.linspace(-1.0, 1.0, 81)
 
-    def loss(frequency: th.Tensor, asked: th.Tensor) -> float:
-        mean = th.zeros(2, NUM_ACTIONS)
-        mean[:, INDEX["frequency"]] = frequency
-        return float(imitation_loss(mean, asked, 1.0).mean())
+    def least(asked: th.Tensor) -> tuple[float, float]:
+        """Frequency and length of the least mean loss."""
+        mean = th.zeros(81, 81, len(asked), NUM_ACTIONS)
+        mean[..., INDEX["frequency"]] = th.tensor(tried)[:, None, None]
+        mean[..., INDEX["stance_length"]] = th.tensor(tried)[None, :, None]
+        every = asked.expand(81, 81, *asked.shape).reshape(-1, GUIDANCE)
+        loss = imitation_loss(mean.view(-1, NUM_ACTIONS), every, 1.0).view(81, 81, -1).mean(2)
+        at = divmod(int(loss.argmin()), 81)
+        return tried[at[0]], tried[at[1]]
 
-    free = th.cat([both[:, :NUM_ACTIONS], th.zeros(2, FREQUENCIES)], dim=1)
-    squares = [loss(f, free) for f in tried]
-    assert abs(float(tried[int(np.argmin(squares))])) < 0.01
-    priced = [loss(f, both) for f in tried]
-    assert 0.4 < abs(float(tried[int(np.argmin(priced))])) < 0.6
+    def both(price: np.ndarray) -> th.Tensor:
+        asked = th.cat([guidance(0.0, price), guidance(0.0, price)])
+        asked[:, INDEX["frequency"]] = th.tensor([-0.5, 0.5])
+        asked[:, INDEX["stance_length"]] = th.tensor([0.5, -0.5])
+        return asked
+
+    assert least(both(FREE)) == pytest.approx((0.0, 0.0), abs=1e-9)
+    chosen = least(both(price))
+    assert min(math.dist(chosen, way) for way in ((-0.5, 0.5), (0.5, -0.5))) < 0.1
 
 
-def test_the_price_of_a_frequency() -> None:
-    """Even prices are what they are, a slope keeps its rise, and an action's limit is its scale."""
-    price = th.linspace(0.0, 3.0, FREQUENCIES)[None]
-    even = th.full((1, FREQUENCIES), 2.0)
-    for limit in (1.0, 2.0):
-        asked = th.tensor([0.25 * limit])
-        assert float(expected_price(asked, even, limit)) == pytest.approx(2.0)
-        assert float(expected_price(asked, price, limit)) == pytest.approx(3.0 * 0.625, abs=1e-3)
+@pytest.mark.parametrize("limit", [1.0, 2.0])
+def test_the_price_of_a_stride(limit: float) -> None:
+    """Even prices are what they are, slopes keep their rise, and an action's limit is its scale."""
+    along_f = th.linspace(0.0, 3.0, FREQUENCIES)[:, None].expand(FREQUENCIES, LENGTHS)
+    along_l = th.linspace(0.0, 1.0, LENGTHS).expand(FREQUENCIES, LENGTHS)
+    asked = limit * th.tensor([[0.25, -0.2]])
+
+    def price(of: th.Tensor) -> float:
+        return float(expected_price(asked, of[None], limit))
+
+    assert price(th.full((FREQUENCIES, LENGTHS), 2.0)) == pytest.approx(2.0)
+    assert price(along_f) == pytest.approx(3.0 * 0.625, abs=1e-3)
+    assert price(along_l) == pytest.approx(0.4, abs=2e-3)
+    assert price(along_f + along_l) == pytest.approx(3.0 * 0.625 + 0.4, abs=3e-3)
 
 
 def test_without_a_price_it_is_the_mean_square() -> None:
     mean = th.full((1, NUM_ACTIONS), 0.3)
-    loss = imitation_loss(mean, guidance(0.1, np.zeros(FREQUENCIES)), 1.0)
-    assert float(loss) == pytest.approx(0.04)
+    assert float(imitation_loss(mean, guidance(0.1, FREE), 1.0)) == pytest.approx(0.04)

@@ -8,6 +8,7 @@ from tdgc.sim.robot import Array
 from tdgc.sim.terrain import make_tile
 from tdgc.tasks.leaps import (
     FREQUENCIES,
+    LENGTHS,
     SPEED,
     STRIDE,
     Landing,
@@ -134,8 +135,9 @@ def test_what_is_imitated_depends_smoothly_on_the_speed() -> None:
     assert smooth[1] < 0.8 * best[1] and smooth[0] < 1.1 * best[0]
 
 
-def test_prices_of_frequencies() -> None:
-    """What the teacher does costs next to nothing, and in front of a trench some cost a fall."""
+def test_prices_of_strides() -> None:
+    """What the teacher does costs next to nothing, and in front of a trench some strides cost a
+    fall; what others cost depends on the frequency and the stance length together."""
     trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
     plan = LeapPlan(1, RANGES)
     plan.look(0, trenches, LANDING.spread)
@@ -143,12 +145,19 @@ def test_prices_of_frequencies() -> None:
     rows, one = np.zeros(len(x), dtype=int), np.ones(len(x))
     motion = Motion(x, SPEED * one, SPEED * one, 0.2 * one, 3.0 * one, STRIDE * one)
     taught = plan.lesson(rows, motion, LANDING)
-    assert taught.price.shape == (len(x), FREQUENCIES)
-    np.testing.assert_array_equal(taught.price.min(axis=1), 0.0)
-    grid = np.linspace(*RANGES.frequency, FREQUENCIES)
-    own = [np.interp(f, grid, p) for f, p in zip(taught.frequency, taught.price, strict=True)]
-    assert np.percentile(own, 90) < 0.1
-    assert np.mean(taught.price.max(axis=1) > 1.0) > 0.5
+    assert taught.price.shape == (len(x), FREQUENCIES, LENGTHS)
+    np.testing.assert_array_equal(taught.price.min(axis=(1, 2)), 0.0)
+    at = [
+        np.round(np.interp(chosen, bounds, [0, count - 1])).astype(int)
+        for chosen, bounds, count in (
+            (taught.frequency, RANGES.frequency, FREQUENCIES),
+            (taught.length, RANGES.stance_length, LENGTHS),
+        )
+    ]
+    assert np.percentile(taught.price[np.arange(len(x)), at[0], at[1]], 80) < 0.3
+    assert np.mean(taught.price.max(axis=(1, 2)) > 1.0) > 0.5
+    best = taught.price.argmin(axis=1)  # frequency of each length, (n, LENGTHS)
+    assert np.mean(np.ptp(best, axis=1) >= 3) > 0.3
 
 
 def test_the_command_of_a_leap() -> None:

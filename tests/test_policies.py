@@ -437,6 +437,8 @@ def test_missing_files(saved):
         (("architecture", "actor"), [8], "tensor 'actor.2.bias' is not part"),
         (("architecture", "actor"), [8, 4], "'actor.1.weight' is F32"),
         (("architecture", "lstm"), 8, "'lstm' is 8 in a file of kind 'mlp'"),
+        (("architecture", "encoder"), [8], r"'encoder' is \[8\] in a file of kind 'mlp'"),
+        (("architecture", "encoder"), 8, "'encoder' must be a list"),
         (("observation", "size"), 0, "'size' of 'observation' must be a whole number"),
         (("observation", "actor_size"), 11, "'actor_size' 11 is more than the 10"),
         (("observation", "actor_size"), 6, "'actor.0.weight' is F32"),

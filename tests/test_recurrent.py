@@ -295,6 +295,15 @@ def run_through(policy, observations: np.ndarray, starts: np.ndarray) -> tuple[t
     return th.stack(actions), th.stack(values)
 
 
+def act_alike(loaded, seen: np.ndarray, starts: np.ndarray, wanted: th.Tensor):
+    """A policy from its file acts as ``run_through`` found; what it remembers in the end."""
+    state = None
+    for row, start, action in zip(seen, starts, wanted, strict=True):
+        given, state = loaded.predict(row, state, start)
+        np.testing.assert_allclose(given, action.clamp(-2.0, 2.0), atol=1e-6)
+    return state
+
+
 def test_a_mirrored_policy_is_symmetric_and_learning_keeps_it_so():
     rng = np.random.default_rng(0)
     seen = rng.normal(size=(STEPS, ENVS, OBS)).astype(np.float32)
@@ -320,10 +329,8 @@ def test_a_mirrored_policy_acts_from_its_file_as_it_was_trained(tmp_path):
     policy = make_model(FastRecurrentPolicy, policy_kwargs={"mirror": MIRROR}).policy
     wanted, _ = run_through(policy, seen, starts)
     policies.save(tmp_path / "policy", policy, {})
-    loaded, state = policies.load(tmp_path / "policy"), None
-    for row, start, action in zip(seen, starts, wanted, strict=True):
-        given, state = loaded.predict(row, state, start)
-        np.testing.assert_allclose(given, action.clamp(-2.0, 2.0), atol=1e-6)
+    loaded = policies.load(tmp_path / "policy")
+    state = act_alike(loaded, seen, starts, wanted)
     assert state[0].shape == (1, ENVS, 2 * HIDDEN)
     with pytest.raises(ValueError, match=rf"it must be two of \(1, 5, {2 * HIDDEN}\)"):
         loaded.predict(seen[0], (np.zeros((1, 5, HIDDEN)),) * 2)
@@ -361,17 +368,6 @@ def test_a_feed_forward_policy_remembers_nothing_and_learns(mirror, tmp_path):
     other = make_model(FastRecurrentPolicy, policy_kwargs={**FORWARD, "mirror": mirror}).policy
     policies.load_into(tmp_path / "policy", other)
     th.testing.assert_close(run_through(other, seen, starts)[0], actions)
-
-
-def test_a_feed_forward_rollout_is_evaluated_as_it_was_collected():
-    model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=FORWARD)
-    model.learn(2 * ENVS * STEPS)
-    for batch in model.rollout_buffer.get(24):
-        values, log_prob, _ = model.policy.evaluate_actions(
-            batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
-        )
-        assert (values.flatten() - batch.old_values).abs().max() < 2e-6
-        assert (log_prob - batch.old_log_prob).abs().max() < 1e-5
 
 
 # ------------------------------------------------------------------ exploring gaits
@@ -455,3 +451,67 @@ def test_a_bonus_on_the_gaits_entropy_falls_to_nothing():
         (-gait_entropy(mean, log_std.exp(), 2.0, 4).sum()).backward()
         optimiser.step()
     assert gait_entropy(mean, log_std.exp(), 2.0, 4).item() > 0.95 * np.log(4.0)
+
+
+# ------------------------------------------------------------------ an encoder before the memory
+
+ENCODED = {"encoder": (7, 5)}
+
+
+@pytest.mark.parametrize("mirror", [None, MIRROR], ids=["plain", "mirrored"])
+def test_an_encoder_learns_and_acts_from_its_file_as_it_was_trained(mirror, tmp_path):
+    rng = np.random.default_rng(3)
+    seen = rng.normal(size=(STEPS, ENVS, OBS)).astype(np.float32)
+    starts = (rng.random((STEPS, ENVS)) < 0.2).astype(np.float32)
+    model = make_model(FastRecurrentPolicy, policy_kwargs={**ENCODED, "mirror": mirror})
+    held = {p for group in model.policy.optimizer.param_groups for p in group["params"]}
+    assert held == set(model.policy.parameters())
+    before = [p.clone() for p in model.policy.parameters()]
+    model.learn(2 * ENVS * STEPS)
+    assert all((a != b).any() for a, b in zip(model.policy.parameters(), before, strict=True))
+    wanted, values = run_through(model.policy, seen, starts)
+    if mirror is not None:
+        image = seen[..., list(MIRROR.obs_index)] * np.float32(MIRROR.obs_sign)
+        mirrored, same = run_through(model.policy, image, starts)
+        th.testing.assert_close(mirrored, wanted * th.tensor([1.0, -1.0]))
+        th.testing.assert_close(same, values)
+    policies.save(tmp_path / "policy", model.policy, {})
+    loaded = policies.load(tmp_path / "policy")
+    assert (loaded.kind, loaded.header.lstm, loaded.header.encoder) == ("lstm", HIDDEN, (7, 5))
+    # The head is given 5 of the encoder after what the LSTM remembers.
+    assert loaded.tensors["actor.0.weight"].shape[1] == HIDDEN + 5
+    act_alike(loaded, seen, starts, wanted)
+    other = make_model(FastRecurrentPolicy, policy_kwargs={**ENCODED, "mirror": mirror}).policy
+    policies.load_into(tmp_path / "policy", other)
+    th.testing.assert_close(run_through(other, seen, starts)[0], wanted)
+    bare = make_model(FastRecurrentPolicy, policy_kwargs={"mirror": mirror}).policy
+    with pytest.raises(policies.PolicyFileError, match=r"encoder is \(7, 5\), this policy's \(\)"):
+        policies.load_into(tmp_path / "policy", bare)
+
+
+def test_what_is_encoded_goes_past_the_memory():
+    """With a memory that forgets everything at once the policy still answers what it sees."""
+    policy = make_model(FastRecurrentPolicy, policy_kwargs=ENCODED).policy
+    with th.no_grad():
+        for parameter in policy.lstm_actor.lstm.parameters():
+            parameter.zero_()
+    seen = np.random.default_rng(4).normal(size=(STEPS, ENVS, OBS)).astype(np.float32)
+    actions, _ = run_through(policy, seen, np.zeros((STEPS, ENVS), dtype=np.float32))
+    assert actions.std() > 1e-3
+
+
+def test_an_encoder_needs_a_memory():
+    with pytest.raises(ValueError, match=r"^an encoder stands before LSTMs"):
+        make_model(FastRecurrentPolicy, policy_kwargs={**ENCODED, **FORWARD})
+
+
+@pytest.mark.parametrize("kind", [FORWARD, ENCODED], ids=["feed-forward", "encoded"])
+def test_a_rollout_is_evaluated_as_it_was_collected(kind):
+    model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=kind)
+    model.learn(2 * ENVS * STEPS)
+    for batch in model.rollout_buffer.get(24):
+        values, log_prob, _ = model.policy.evaluate_actions(
+            batch.observations, batch.actions, batch.lstm_states, batch.episode_starts
+        )
+        assert (values.flatten() - batch.old_values).abs().max() < 2e-6
+        assert (log_prob - batch.old_log_prob).abs().max() < 1e-5

@@ -649,9 +649,13 @@ def test_flags_and_folders_that_cannot_be_used(
         ("ppo.gait_hold=0", "'ppo.gait_hold' must be at least 1, not 0"),
         ("ppo.gait_ent_coef=-1", "'ppo.gait_ent_coef' must be at least 0, not -1"),
         ("ppo.imitation_coef=-1", "'ppo.imitation_coef' must be at least 0, not -1"),
+        ("ppo.encoder=[0]", "'ppo.encoder' must be at least 1, not 0"),
     ):
         assert train_high.main(["--set", setting, "--out", str(empty)]) == 2
         assert capsys.readouterr().err.startswith(f"train_high.py: {message}")
+    alone = ["--set", "ppo.lstm=null", "--set", "ppo.encoder=[8]"]
+    assert train_high.main([*alone, "--out", str(empty)]) == 2
+    assert "'ppo.encoder' must be [] where 'ppo.lstm' is null" in capsys.readouterr().err
     assert not empty.exists()
 
 

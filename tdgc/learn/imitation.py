@@ -2,11 +2,11 @@
 
 The apprentice acts, the teacher says at every decision what it would have done, and the recurrent
 policy learns to say so from its own observations: DAgger (Ross et al. 2011), with a teacher that
-knows more than its student (Chen et al. 2019, "Learning by cheating"). Of the steps of a leap the
-teacher says what each frequency would cost, and the policy learns the cheapest (Ross and Bagnell
-2014, AggreVaTe): with the teacher's frequency itself as the only target it learned a mean of two
-ways over a trench, which leads into it. The critic learns what these episodes return, so that PPO
-goes on with a critic that knows the policy.
+knows more than its student (Chen et al. 2019, "Learning by cheating"). Of a leap the teacher says
+what each step frequency with each stance length would cost, and the policy learns the cheapest
+(Ross and Bagnell 2014, AggreVaTe): with the teacher's choice itself as the only target it learned a
+mean of two ways over a trench, which leads into it. The critic learns what these episodes return,
+so that PPO goes on with a critic that knows the policy.
 """
 
 from typing import Any, cast
@@ -19,11 +19,11 @@ from torch import nn
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
 from tdgc.tasks.high_observation import GUIDANCE
-from tdgc.tasks.leaps import FREQUENCIES
+from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 
-_FREQUENCY = INDEX["frequency"]
+_STRIDE = [INDEX["frequency"], INDEX["stance_length"]]
 # As in the comparison of docs/experiments.md: what a price weighs against a squared error in the
-# action, and what is left of that error of a frequency that has a price.
+# action, and what is left of that error of a stride that has a price.
 _PRICE_WEIGHT, _PRICED = 10.0, 0.1
 
 
@@ -41,7 +41,7 @@ class TaughtPolicy(FastRecurrentPolicy):
         super().__init__(own, *args, **kwargs)
 
     def bonus(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
-        limit = float(cast(spaces.Box, self.action_space).high[_FREQUENCY])
+        limit = float(cast(spaces.Box, self.action_space).high[_STRIDE[0]])
         error = imitation_loss(mean, obs[..., self.seen :], limit)
         return super().bonus(obs, mean) - self.imitation_weight * error
 
@@ -67,13 +67,21 @@ class ApprenticePolicy(TaughtPolicy):
         self.log_std.requires_grad_(False)  # what exploration is to begin with
 
 
-def expected_price(frequency: th.Tensor, price: th.Tensor, limit: float) -> th.Tensor:
-    """Price of frequencies (n,), actions from -limit to limit, where ``price`` (n, FREQUENCIES)
-    has it at even steps: a mean over about two steps, so that its slope is felt from afar."""
-    grid = th.linspace(-limit, limit, FREQUENCIES, device=price.device)
-    step = 2.0 * limit / (FREQUENCIES - 1)
-    near = th.softmax(-0.5 * ((grid - frequency[:, None]) / step).square(), dim=1)
-    return (near * price).sum(1)
+def expected_price(stride: th.Tensor, price: th.Tensor, limit: float) -> th.Tensor:
+    """Price of strides (n, 2), the actions of frequency and stance length, (n,).
+
+    Args:
+        stride: from -limit to limit.
+        price: (n, FREQUENCIES, LENGTHS) at even steps between these; what counts is a mean over
+            about two steps each way, so that the slope is felt from afar.
+        limit: of the actions.
+    """
+    for action, count in ((stride[:, 0], FREQUENCIES), (stride[:, 1], LENGTHS)):
+        grid = th.linspace(-limit, limit, count, device=price.device)
+        step = 2.0 * limit / (count - 1)
+        near = th.softmax(-0.5 * ((grid - action[:, None]) / step).square(), dim=1)
+        price = th.einsum("nf,nf...->n...", near, price)
+    return price
 
 
 def imitation_loss(mean: th.Tensor, guidance: th.Tensor, limit: float) -> th.Tensor:
@@ -81,8 +89,8 @@ def imitation_loss(mean: th.Tensor, guidance: th.Tensor, limit: float) -> th.Ten
     taught, price = guidance[:, :NUM_ACTIONS], guidance[:, NUM_ACTIONS:]
     error = (mean - taught).square()
     weight = th.ones_like(error)
-    weight[:, _FREQUENCY] = th.where(price.amax(1) > 0.0, _PRICED, 1.0)
-    cost = expected_price(mean[:, _FREQUENCY], price, limit)
+    weight[:, _STRIDE] = th.where(price.amax(1, keepdim=True) > 0.0, _PRICED, 1.0)
+    cost = expected_price(mean[:, _STRIDE], price.view(-1, FREQUENCIES, LENGTHS), limit)
     return ((weight * error).sum(1) + _PRICE_WEIGHT * cost) / NUM_ACTIONS
 
 
@@ -94,7 +102,7 @@ class Apprentice(FastRecurrentPPO):
         policy = cast(ApprenticePolicy, self.policy)
         policy.set_training_mode(True)
         self._update_learning_rate(policy.optimizer)
-        limit = float(cast(spaces.Box, self.action_space).high[_FREQUENCY])
+        limit = float(cast(spaces.Box, self.action_space).high[_STRIDE[0]])
         losses, value_losses = [], []
         for _ in range(self.n_epochs):
             for batch in self.rollout_buffer.get(self.batch_size):

@@ -9,8 +9,9 @@ A minibatch holds whole environments, as in OpenAI Baselines' PPO2 for recurrent
 LSTMs see padding, and only where an episode starts within the rollout.
 """
 
+import functools
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -28,7 +29,13 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from tdgc.policies.files import Mirror
-from tdgc.policies.learning import MirroredHead, MirroredLSTM, MirroredMlpExtractor, NoMemory
+from tdgc.policies.learning import (
+    EncodedLSTM,
+    MirroredHead,
+    MirroredLSTM,
+    MirroredMlpExtractor,
+    NoMemory,
+)
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,8 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
 
     It takes the same arguments, has the same parameters and computes the same numbers; with a
     ``mirror`` it is exactly left-right symmetric, and so is its value. With None for
-    ``lstm_hidden_size`` it is feed-forward, and the networks behind the LSTMs are all there is.
+    ``lstm_hidden_size`` it is feed-forward, and the networks behind the LSTMs are all there is. An
+    ``encoder`` of these layer sizes stands before either LSTM, see ``EncodedLSTM``.
 
     Attributes:
         gait_bonus: weight of the gaits' entropy beside that of the normal distributions in what
@@ -78,7 +86,8 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
 
     Raises:
         ValueError: other LSTMs than plain ones of one layer, one each for actor and critic, or
-            other actions than normally distributed ones with one deviation each.
+            other actions than normally distributed ones with one deviation each; an encoder before
+            none.
     """
 
     def __init__(
@@ -89,12 +98,16 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         *,
         mirror: Mirror | None = None,
         lstm_hidden_size: int | None = 256,
+        encoder: Sequence[int] = (),
         gait: GaitNoise | None = None,
         **kwargs: Any,
     ) -> None:
         # SB3's Adam, in one operation instead of a dozen for each parameter.
         kwargs.setdefault("optimizer_kwargs", {"eps": 1e-5, "fused": True})
         self.mirror, self.gait, self.gait_bonus = mirror, gait, 0.0
+        self.encoder_arch = tuple(encoder)
+        if encoder and lstm_hidden_size is None:
+            raise ValueError("an encoder stands before LSTMs, and a feed-forward policy has none")
         size = observation_space.shape[0] if lstm_hidden_size is None else lstm_hidden_size
         super().__init__(
             observation_space, action_space, lr_schedule, lstm_hidden_size=size, **kwargs
@@ -107,9 +120,10 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
             )
         if not isinstance(self.action_dist, DiagGaussianDistribution):
             raise ValueError("FastRecurrentPolicy has normally distributed actions, without gSDE")
-        if lstm_hidden_size is None:
-            self.lstm_actor = NoMemory(size)  # type: ignore[assignment]
-            self.lstm_critic = NoMemory(size)  # type: ignore[assignment]
+        if lstm_hidden_size is None or encoder:
+            self.lstm_actor, self.lstm_critic = (  # type: ignore[assignment]
+                self._memory(lstm_hidden_size) for _ in range(2)
+            )
             self.lstm_hidden_state_shape = (1, 1, self.lstm_actor.hidden_size)
             self.optimizer = self.optimizer_class(
                 self.parameters(),
@@ -128,11 +142,17 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
             self.action_net = MirroredHead(cast(nn.Linear, self.action_net), mirror)
             self.value_net = MirroredHead(self.value_net, None)  # type: ignore[assignment]
 
+    def _memory(self, hidden: int | None) -> NoMemory | EncodedLSTM:
+        if hidden is None:
+            return NoMemory(self.features_dim)
+        memory = EncodedLSTM(self.features_dim, self.encoder_arch, hidden, self.activation_fn)
+        memory.encoder.apply(functools.partial(self.init_weights, gain=math.sqrt(2.0)))  # as SB3's
+        return memory.to(self.device)
+
     def _build_mlp_extractor(self) -> None:
         kind = MlpExtractor if self.mirror is None else MirroredMlpExtractor
-        self.mlp_extractor = kind(
-            self.lstm_output_dim, self.net_arch, self.activation_fn, self.device
-        )
+        size = self.lstm_output_dim + (self.encoder_arch[-1] if self.encoder_arch else 0)
+        self.mlp_extractor = kind(size, self.net_arch, self.activation_fn, self.device)
 
     def forward(  # type: ignore[override]  # as sb3-contrib has it
         self,

@@ -97,6 +97,8 @@ class Policy:
         self.state_size = sides * header.lstm if header.lstm else 0
         self.actor = Actor(header, tensors)
         self._lstm = [tensors[f"actor_lstm.{t}"] for t in LSTM_TENSORS] if header.lstm else []
+        names = [f"actor_encoder.{i}" for i in range(len(header.encoder))]
+        self._encoder = [(tensors[f"{n}.weight"], tensors[f"{n}.bias"]) for n in names]
         log_std = tensors["log_std"].numpy()
         if header.mirror is not None:
             log_std = 0.5 * (log_std + log_std[list(header.mirror.action_index)])
@@ -159,12 +161,14 @@ class Policy:
         With a mirror ``hidden`` is twice the LSTM's size: first the side that is seen, then its
         mirror image.
         """
-        if self.actor.mirror is None:
-            h, c = th.lstm_cell(x, state, *self._lstm)
-            return h, (h, c)
-        h, c = (th.cat(part.chunk(2, dim=-1)) for part in state)
-        h, c = th.lstm_cell(self.actor.both_sides(x), (h, c), *self._lstm)
-        return h, (th.cat(h.chunk(2), dim=-1), th.cat(c.chunk(2), dim=-1))
+        sides = 1 if self.actor.mirror is None else 2
+        x = self.actor.both_sides(x)
+        for weight, bias in self._encoder:
+            x = self.actor.activation(F.linear(x, weight, bias))
+        h, c = (th.cat(part.chunk(sides, dim=-1)) for part in state)
+        h, c = th.lstm_cell(x, (h, c), *self._lstm)
+        latent = th.cat([h, x], dim=-1) if self._encoder else h
+        return latent, (th.cat(h.chunk(sides), dim=-1), th.cat(c.chunk(sides), dim=-1))
 
     @staticmethod
     def _previous(

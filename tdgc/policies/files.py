@@ -8,7 +8,8 @@ critic, ``NAME.json`` says what they mean::
      "architecture": {"activation": "elu",            elu, relu or tanh, after each hidden layer
                       "actor": [256, 128],            hidden sizes
                       "critic": [256, 128],
-                      "lstm": null},                  hidden size of both LSTMs; null for "mlp"
+                      "lstm": null,                   hidden size of both LSTMs; null for "mlp"
+                      "encoder": [128]},              sizes before both LSTMs; left out if none
      "observation": {"size": 95, "actor_size": 70},   [actor part | critic-only part]
      "mirror": null,                                  or how left and right change places
      "action": {"size": 12, "low": [...], "high": [...]},            null: unbounded
@@ -18,7 +19,9 @@ critic, ``NAME.json`` says what they mean::
 Tensors are float32, named ``actor.0.weight``, ``actor.0.bias``, ... (the last one gives the mean
 action), ``critic.*`` likewise (the last one gives the value), ``log_std``, and for "lstm" also
 ``actor_lstm.*`` and ``critic_lstm.*`` with ``weight_ih``, ``weight_hh``, ``bias_ih``,
-``bias_hh`` (gate order i, f, g, o as in PyTorch).
+``bias_hh`` (gate order i, f, g, o as in PyTorch). With an encoder, ``actor_encoder.*`` and
+``critic_encoder.*`` are its layers; actor and critic are then given the LSTM's output and, after
+it, the encoder's.
 """
 
 import dataclasses
@@ -102,6 +105,7 @@ class Header:
     high: tuple[float, ...]
     meta: dict[str, Any]
     mirror: Mirror | None = None  # of the actor's part
+    encoder: tuple[int, ...] = ()
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Name and shape of every tensor, in the order they are written."""
@@ -111,11 +115,15 @@ class Header:
             ("critic", self.obs_dim, self.critic, 1),
         ):
             if self.lstm is not None:
+                for i, size in enumerate(self.encoder):
+                    shapes[f"{net}_encoder.{i}.weight"] = (size, inputs)
+                    shapes[f"{net}_encoder.{i}.bias"] = (size,)
+                    inputs = size
                 gates = 4 * self.lstm
                 lstm_shapes = ((gates, inputs), (gates, self.lstm), (gates,), (gates,))
                 for tensor, shape in zip(LSTM_TENSORS, lstm_shapes, strict=True):
                     shapes[f"{net}_lstm.{tensor}"] = shape
-                inputs = self.lstm
+                inputs = self.lstm + (self.encoder[-1] if self.encoder else 0)
             for i, size in enumerate((*hidden, outputs)):
                 shapes[f"{net}.{i}.weight"] = (size, inputs)
                 shapes[f"{net}.{i}.bias"] = (size,)
@@ -141,6 +149,7 @@ class Header:
                 "actor": list(self.actor),
                 "critic": list(self.critic),
                 "lstm": self.lstm,
+                **({"encoder": list(self.encoder)} if self.encoder else {}),
             },
             "observation": {"size": self.obs_dim, "actor_size": self.actor_dim},
             "action": {
@@ -186,12 +195,17 @@ class Header:
             raise PolicyFileError(f"'meta' must be a table, not {_shown(meta)}")
 
         arch = table["architecture"]
-        _check_keys(arch, ("activation", "actor", "critic", "lstm"), "'architecture'")
+        if isinstance(arch, dict):
+            arch = {"encoder": []} | arch  # files from before there was one lack it
+        _check_keys(arch, ("activation", "actor", "critic", "lstm", "encoder"), "'architecture'")
         if not isinstance(arch["activation"], str) or arch["activation"] not in ACTIVATIONS:
             known = ", ".join(ACTIVATIONS)
             raise PolicyFileError(f"activation {_shown(arch['activation'])}; known: {known}")
         if (arch["lstm"] is not None) != (kind == "lstm"):
             raise PolicyFileError(f"'lstm' is {_shown(arch['lstm'])} in a file of kind '{kind}'")
+        encoder = _sizes(arch["encoder"], "'encoder'")
+        if encoder and kind != "lstm":
+            raise PolicyFileError(f"'encoder' is {list(encoder)} in a file of kind '{kind}'")
 
         observation = table["observation"]
         _check_keys(observation, ("size", "actor_size"), "'observation'")
@@ -219,6 +233,7 @@ class Header:
             high=high,
             meta=meta,
             mirror=_mirror(table["mirror"], actor_dim, action_dim),
+            encoder=encoder,
         )
         if header.nbytes() > _MAX_WEIGHT_BYTES:
             raise PolicyFileError(f"{header.nbytes()} bytes of weights, too large to be a policy")

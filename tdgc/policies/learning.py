@@ -1,6 +1,7 @@
 """The side that learns: an SB3 policy whose critic sees more than its actor, and its saving."""
 
 import os
+from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
 import torch as th
@@ -113,9 +114,45 @@ class NoMemory(nn.Module):
         return x, state
 
 
+class EncodedLSTM(nn.Module):
+    """An LSTM behind an encoder, whose output goes past the LSTM, too.
+
+    What is to be done now need not pass through the memory. It is called as ``nn.LSTM`` is.
+
+    Attributes:
+        encoder, lstm: its parts.
+        input_size, hidden_size, num_layers: as ``nn.LSTM`` has them, seen from outside.
+    """
+
+    def __init__(
+        self,
+        input_size: int,
+        encoder: Sequence[int],
+        hidden_size: int,
+        activation_fn: type[nn.Module],
+    ) -> None:
+        super().__init__()
+        self.input_size, self.hidden_size, self.num_layers = input_size, hidden_size, 1
+        self.encoder = nn.Sequential(*create_mlp(input_size, -1, list(encoder), activation_fn))
+        self.lstm = nn.LSTM(encoder[-1], hidden_size)
+
+    def forward(
+        self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
+    ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
+        """(steps, n, input_size) and the state -> (steps, n, hidden_size + encoder's last), and
+        the state after it."""
+        encoded = self.encoder(x)
+        remembered, after = self.lstm(encoded, state)
+        return th.cat([remembered, encoded], dim=-1), after
+
+
+#: What may stand where sb3-contrib has an LSTM.
+Memory = nn.LSTM | NoMemory | EncodedLSTM
+
+
 class MirroredLSTM(nn.Module):
-    """An LSTM, or ``NoMemory``, that sees an observation and its mirror image, in two halves of a
-    wider state.
+    """An LSTM, or what stands in its place, that sees an observation and its mirror image, in two
+    halves of a wider state.
 
     It is called as ``nn.LSTM`` is. ``MirroredMlpExtractor`` and ``MirroredHead`` go on with the
     halves.
@@ -125,7 +162,7 @@ class MirroredLSTM(nn.Module):
         input_size, hidden_size, num_layers: as ``nn.LSTM`` has them, seen from outside.
     """
 
-    def __init__(self, lstm: nn.LSTM | NoMemory, mirror: Mirror) -> None:
+    def __init__(self, lstm: Memory, mirror: Mirror) -> None:
         super().__init__()
         self.lstm = lstm
         self.input_size, self.num_layers = lstm.input_size, lstm.num_layers
@@ -136,7 +173,8 @@ class MirroredLSTM(nn.Module):
     def forward(
         self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
     ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
-        """(steps, n, input_size) and two (1, n, hidden_size) -> (steps, n, hidden_size), two."""
+        """(steps, n, input_size) and two (1, n, hidden_size) -> both sides' outputs side by side,
+        and the two after it."""
         index, sign = cast(th.Tensor, self.index), cast(th.Tensor, self.sign)
         both = th.cat([x, x[..., index] * sign], dim=1)
         h, c = (th.cat(part.chunk(2, dim=-1), dim=1) for part in state)
@@ -235,9 +273,9 @@ def save(path: str | os.PathLike[str], policy: ActorCriticPolicy, meta: dict[str
     Args:
         path: with or without one of the two suffixes; missing folders are made.
         policy: ``AsymmetricActorCriticPolicy``, SB3's ``MlpPolicy`` or sb3-contrib's
-            ``MlpLstmPolicy`` (one layer, an LSTM each for actor and critic, or ``NoMemory`` in
-            their places) and subclasses, with a flat Box observation and action and a
-            state-independent standard deviation.
+            ``MlpLstmPolicy`` (one layer, an LSTM each for actor and critic, or ``NoMemory`` or
+            ``EncodedLSTM`` in their places) and subclasses, with a flat Box observation and action
+            and a state-independent standard deviation.
         meta: anything JSON can say: configuration, seed, steps, wall time, code version.
 
     Raises:
@@ -258,7 +296,7 @@ def load_into(path: str | os.PathLike[str], policy: ActorCriticPolicy) -> dict[s
     """
     header, tensors = read(path)
     mine = _describe(policy, header.meta)
-    names = ("kind", "activation", "lstm", "actor", "critic", "obs_dim", "actor_dim")
+    names = ("kind", "activation", "encoder", "lstm", "actor", "critic", "obs_dim", "actor_dim")
     for name in names:
         if getattr(mine, name) != getattr(header, name):
             raise PolicyFileError(
@@ -292,9 +330,11 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
     if not activations:
         raise ValueError(f"activation {policy.activation_fn}; known: {', '.join(ACTIVATIONS)}")
 
-    lstm = None
+    lstm, encoder = None, tuple[int, ...]()
     if isinstance(policy, RecurrentActorCriticPolicy):
         memory = _inner(policy.lstm_actor)
+        if isinstance(memory, EncodedLSTM):
+            encoder = tuple(len(layer.weight) for layer in _linear(memory.encoder))
         lstm = None if isinstance(memory, NoMemory) else memory.hidden_size
         if policy.lstm_critic is None or policy.lstm_kwargs or policy.lstm_actor.num_layers != 1:
             raise ValueError("only plain LSTMs of one layer, one each for actor and critic")
@@ -320,11 +360,16 @@ def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
         high=tuple(float(x) for x in box.high),
         meta=meta,
         mirror=mirror if mirror is None else mirror.actor_part(actor_dim),
+        encoder=encoder,
     )
 
 
-def _inner(lstm: nn.LSTM | NoMemory | MirroredLSTM) -> nn.LSTM | NoMemory:
+def _inner(lstm: Memory | MirroredLSTM) -> Memory:
     return lstm.lstm if isinstance(lstm, MirroredLSTM) else lstm
+
+
+def _linear(layers: Iterable[nn.Module]) -> list[nn.Linear]:
+    return [layer for layer in layers if isinstance(layer, nn.Linear)]
 
 
 def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
@@ -335,14 +380,18 @@ def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
         ("actor", extractor.policy_net, policy.action_net),
         ("critic", extractor.value_net, policy.value_net),
     ):
+        head = output.linear if isinstance(output, MirroredHead) else output
+        parts = {net: _linear((*body, head))}
         if isinstance(policy, RecurrentActorCriticPolicy):
             lstm = _inner(getattr(policy, f"lstm_{net}"))
+            if isinstance(lstm, EncodedLSTM):
+                parts[f"{net}_encoder"] = _linear(lstm.encoder)
+                lstm = lstm.lstm
             if isinstance(lstm, nn.LSTM):
                 for tensor in LSTM_TENSORS:
                     tensors[f"{net}_lstm.{tensor}"] = getattr(lstm, f"{tensor}_l0")
-        head = output.linear if isinstance(output, MirroredHead) else output
-        layers = [m for m in (*body, head) if isinstance(m, nn.Linear)]
-        for i, layer in enumerate(layers):
-            tensors[f"{net}.{i}.weight"] = layer.weight
-            tensors[f"{net}.{i}.bias"] = layer.bias
+        for part, layers in parts.items():
+            for i, layer in enumerate(layers):
+                tensors[f"{part}.{i}.weight"] = layer.weight
+                tensors[f"{part}.{i}.bias"] = layer.bias
     return tensors

@@ -287,7 +287,7 @@ class NavigationTask:
             return seen
         commands = self.teacher.commands(self.locomotion, self.goal)
         self._taught = self.decoder.encode(self.decoder.nearest(commands))
-        parts = (seen, self._taught, self.teacher.price)
+        parts = (seen, self._taught, self.teacher.price.reshape(self.num_robots, -1))
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
     @property

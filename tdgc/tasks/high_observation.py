@@ -14,12 +14,12 @@ from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
 from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, columns, in_place, mirror, width
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import FAMILIES
-from tdgc.tasks.leaps import FREQUENCIES
+from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP
 
 GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
 #: Width of what a teacher adds to an observation.
-GUIDANCE = NUM_ACTIONS + FREQUENCIES
+GUIDANCE = NUM_ACTIONS + FREQUENCIES * LENGTHS
 
 #: The semantic cue: one-hot over the families, and one place for "unknown".
 SEMANTIC = (*FAMILIES, "unknown")

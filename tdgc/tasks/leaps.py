@@ -49,7 +49,7 @@ _LENGTH_PRICE = 2.0  # 1/m^2, of rear feet that do not land where the front feet
 # do, too, hence their price in 1/Hz^2. Of 24 tiles of level 6 and of level 10 a teacher crossed 12
 # and 4 without both, 23 and 5 with the first alone, and 24 and 11 with both (docs/experiments.md).
 _DECIDED, _CHANGE_PRICE = 0.4, 0.5
-FREQUENCIES = 25  # that are tried at each decision, evenly over the range of the command
+FREQUENCIES, LENGTHS = 25, 11  # tried at each decision, evenly over the ranges of the commands
 # How robots speed up, of two low policies: 0.8, 1.1 and 1.2 m/s at the first landings after a rest,
 # and 1.14 m/s for 1.2 in the long run. Without it a trench right behind the start was misjudged by
 # 7 cm.
@@ -151,8 +151,8 @@ class Lesson(NamedTuple):
 
     Attributes:
         frequency, length: (n,) Hz and m, of steps and stance.
-        price: (n, FREQUENCIES) what each frequency costs more than the best one does; 0 for robots
-            that have decided already.
+        price: (n, FREQUENCIES, LENGTHS) what each choice costs more than the best one does; 0 for
+            robots that have decided already.
     """
 
     frequency: Array
@@ -173,7 +173,7 @@ class LeapPlan:
         low, high = ranges.stance_length
         self._clear = clear
         self._speed = min(SPEED, ranges.vx[1])
-        self._lengths = np.linspace(low, high, 1 + round((high - low) / _STEP))
+        self._lengths = np.linspace(low, high, LENGTHS)
         self._frequencies = np.linspace(*ranges.frequency, FREQUENCIES)
         self._x = _STEP * np.arange(1 + round(TILE_SIZE / _STEP))
         # Price of front feet at each place, with each stance length, and of all that follows.
@@ -209,7 +209,7 @@ class LeapPlan:
         return self._held(motion, self._frequencies[frequency], self._lengths[length])
 
     def lesson(self, rows: NDArray[np.integer], motion: Motion, landing: Landing) -> "Lesson":
-        """As ``steps``, for who is to be imitated, and what other frequencies would cost."""
+        """As ``steps``, for who is to be imitated, and what other choices would cost."""
         cost = self._costs(rows, motion, landing)
         frequency, length = self._best(cost)
         off = np.abs(self._frequencies - self._frequencies[frequency][:, None])
@@ -218,8 +218,7 @@ class LeapPlan:
         alike = (off < _NEAR[1] + 1e-9)[:, None, :]
         weight = near * alike * np.exp((cost.min(axis=(1, 2), keepdims=True) - cost) / _TEMPERATURE)
         weight /= weight.sum(axis=(1, 2), keepdims=True)
-        price = np.where(alike, cost, np.inf).min(axis=2)
-        price -= price.min(axis=1, keepdims=True)
+        price = cost - cost.min(axis=(1, 2), keepdims=True)
         price[motion.clock >= _DECIDED] = 0.0
         means = weight.sum(axis=2) @ self._frequencies, weight.sum(axis=1) @ self._lengths
         return Lesson(*self._held(motion, *means), price)

@@ -22,6 +22,7 @@ from tdgc.sim.terrain import CELL, CLUTTER, TILE_SAMPLES, TILE_SIZE, TileField
 from tdgc.tasks.leaps import (
     BEYOND,
     FREQUENCIES,
+    LENGTHS,
     SPEED,
     Landing,
     LeapPlan,
@@ -157,8 +158,8 @@ class Teacher:
 
     Attributes:
         speed: (M,) m/s ahead, as leaps should have it by now and as it was seen.
-        price: (M, FREQUENCIES) of the last ``commands``, what each step frequency would have cost
-            more than the best one; 0 for robots that do not leap.
+        price: (M, FREQUENCIES, LENGTHS) of the last ``commands``, what each step frequency with
+            each stance length would have cost more than the best; 0 for robots that do not leap.
     """
 
     def __init__(
@@ -184,7 +185,7 @@ class Teacher:
         np.clip(behaviour, bounds[:, 0], bounds[:, 1], out=behaviour)
         self._command, self._uneven = commands[:-1], commands[-1]
         self.speed = np.zeros(m)
-        self.price = np.zeros((m, FREQUENCIES))
+        self.price = np.zeros((m, FREQUENCIES, LENGTHS))
         self._top_speed = np.array([style.speed for style in styles])
         self._uphill = np.array([style.uphill for style in styles])
         self._climb = np.zeros(m)  # m/s to the left of the tile's length
