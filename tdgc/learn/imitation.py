@@ -40,10 +40,13 @@ class TaughtPolicy(FastRecurrentPolicy):
         own = spaces.Box(observation_space.low[: self.seen], observation_space.high[: self.seen])
         super().__init__(own, *args, **kwargs)
 
-    def bonus(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
+    def error(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
+        """``imitation_loss`` of the mean actions ``mean`` (n, 13) taken at ``obs``, (n,)."""
         limit = float(cast(spaces.Box, self.action_space).high[_STRIDE[0]])
-        error = imitation_loss(mean, obs[..., self.seen :], limit)
-        return super().bonus(obs, mean) - self.imitation_weight * error
+        return imitation_loss(mean, obs[..., self.seen :], limit)
+
+    def bonus(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
+        return super().bonus(obs, mean) - self.imitation_weight * self.error(obs, mean)
 
     def forward(self, obs: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         return super().forward(obs[..., : self.seen], *args, **kwargs)
@@ -102,7 +105,6 @@ class Apprentice(FastRecurrentPPO):
         policy = cast(ApprenticePolicy, self.policy)
         policy.set_training_mode(True)
         self._update_learning_rate(policy.optimizer)
-        limit = float(cast(spaces.Box, self.action_space).high[_STRIDE[0]])
         losses, value_losses = [], []
         for _ in range(self.n_epochs):
             for batch in self.rollout_buffer.get(self.batch_size):
@@ -110,7 +112,7 @@ class Apprentice(FastRecurrentPPO):
                 mean, values = policy.unroll(
                     observations, cast(Any, batch).lstm_states, cast(Any, batch).episode_starts
                 )
-                imitation = imitation_loss(mean, observations[:, policy.seen :], limit).mean()
+                imitation = policy.error(observations, mean).mean()
                 value_loss = nn.functional.mse_loss(values.flatten(), batch.returns)
                 policy.optimizer.zero_grad()
                 loss = imitation + self.vf_coef * value_loss

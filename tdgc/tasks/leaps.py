@@ -216,9 +216,9 @@ class LeapPlan:
         near = (off < _NEAR[0])[:, :, None]
         off = np.abs(self._lengths - self._lengths[length][:, None])
         alike = (off < _NEAR[1] + 1e-9)[:, None, :]
-        weight = near * alike * np.exp((cost.min(axis=(1, 2), keepdims=True) - cost) / _TEMPERATURE)
-        weight /= weight.sum(axis=(1, 2), keepdims=True)
         price = cost - cost.min(axis=(1, 2), keepdims=True)
+        weight = near * alike * np.exp(-price / _TEMPERATURE)
+        weight /= weight.sum(axis=(1, 2), keepdims=True)
         price[motion.clock >= _DECIDED] = 0.0
         means = weight.sum(axis=2) @ self._frequencies, weight.sum(axis=1) @ self._lengths
         return Lesson(*self._held(motion, *means), price)
