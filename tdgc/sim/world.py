@@ -248,9 +248,10 @@ class World:
                 linearDamping=0.0,
                 angularDamping=0.0,
                 jointDamping=0.0,
-                lateralFriction=self.physics.friction,
                 maxJointVelocity=slowest,
             )
+            # In the call above, with dampings, PyBullet would give it to the trunk instead.
+            client.changeDynamics(body, link, lateralFriction=self.physics.friction)
         # Bullet's default velocity motors would hold the joints.
         client.setJointMotorControlArray(
             body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * NUM_JOINTS
