@@ -28,7 +28,7 @@ from tdgc.errors import InputError
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
-_VERSION = 7  # since the teacher prices strides, not frequencies alone
+_VERSION = 8  # since decisions whose strides have a price weigh more in imitation
 #: Names of what the recurrent learner remembers of the episodes under way.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 

@@ -22,9 +22,10 @@ from tdgc.tasks.high_observation import GUIDANCE
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 
 _STRIDE = [INDEX["frequency"], INDEX["stance_length"]]
-# As in the comparison of docs/experiments.md: what a price weighs against a squared error in the
-# action, and what is left of that error of a stride that has a price.
-_PRICE_WEIGHT, _PRICED = 10.0, 0.1
+# As in the comparisons of docs/experiments.md: what a price weighs against a squared error in the
+# action, what is left of that error of a stride that has a price, and what a decision whose stride
+# has one weighs against others: an error in it leads into a trench, elsewhere most are forgiven.
+_PRICE_WEIGHT, _PRICED, _LEAP_WEIGHT = 10.0, 0.1, 4.0
 
 
 class TaughtPolicy(FastRecurrentPolicy):
@@ -91,10 +92,11 @@ def imitation_loss(mean: th.Tensor, guidance: th.Tensor, limit: float) -> th.Ten
     """How far actions (n, 13) are from what ``guidance`` (n, GUIDANCE) asks for, (n,)."""
     taught, price = guidance[:, :NUM_ACTIONS], guidance[:, NUM_ACTIONS:]
     error = (mean - taught).square()
-    weight = th.ones_like(error)
-    weight[:, _STRIDE] = th.where(price.amax(1, keepdim=True) > 0.0, _PRICED, 1.0)
+    weight, priced = th.ones_like(error), price.amax(1) > 0.0
+    weight[:, _STRIDE] = th.where(priced, _PRICED, 1.0)[:, None]
     cost = expected_price(mean[:, _STRIDE], price.view(-1, FREQUENCIES, LENGTHS), limit)
-    return ((weight * error).sum(1) + _PRICE_WEIGHT * cost) / NUM_ACTIONS
+    loss = ((weight * error).sum(1) + _PRICE_WEIGHT * cost) / NUM_ACTIONS
+    return th.where(priced, _LEAP_WEIGHT, 1.0) * loss
 
 
 class Apprentice(FastRecurrentPPO):
