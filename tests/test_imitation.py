@@ -190,3 +190,11 @@ def test_the_price_of_a_stride(limit: float) -> None:
 def test_without_a_price_it_is_the_mean_square() -> None:
     mean = th.full((1, NUM_ACTIONS), 0.3)
     assert float(imitation_loss(mean, guidance(0.1, FREE), 1.0)) == pytest.approx(0.04)
+
+
+def test_a_decision_whose_stride_has_a_price_weighs_four_times_as_much() -> None:
+    """Its stride counts by the price, here 2 everywhere, and a tenth of its squared errors."""
+    mean = th.full((1, NUM_ACTIONS), 0.3)
+    loss = imitation_loss(mean, guidance(0.1, np.full_like(FREE, 2.0)), 1.0)
+    others, stride = (NUM_ACTIONS - 2) * 0.04, 2 * 0.1 * 0.04 + 10.0 * 2.0
+    assert float(loss) == pytest.approx(4.0 * (others + stride) / NUM_ACTIONS)
