@@ -124,8 +124,25 @@ def _open_onnx(path: Path, table: Table) -> Run:
     for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
         if [(s["name"], s["shape"]) for s in table[side]] != [(x.name, x.shape) for x in found]:
             raise ExportError(f"{path}: its {side} are not those of its interface file")
-    names = [s["name"] for s in table["inputs"]]
-    return lambda values: session.run(None, dict(zip(names, values, strict=True)))
+    # The graph reads and writes these arrays: naming and wrapping new ones takes a sixth of a step.
+    binding = session.io_binding()
+    given, made = ([np.zeros(s["shape"]) for s in table[side]] for side in ("inputs", "outputs"))
+    for signal, array in zip(table["inputs"], given, strict=True):
+        memory = onnxruntime.OrtValue.ortvalue_from_numpy(array)
+        binding.bind_ortvalue_input(signal["name"], memory)
+    for signal, array in zip(table["outputs"], made, strict=True):
+        memory = onnxruntime.OrtValue.ortvalue_from_numpy(array)
+        binding.bind_ortvalue_output(signal["name"], memory)
+
+    def run(values: list[Array]) -> list[Array]:
+        for array, value in zip(given, values, strict=True):
+            if value.shape != array.shape:
+                raise ValueError(f"an input must have the shape {array.shape}, not {value.shape}")
+            array[...] = value
+        session.run_with_iobinding(binding)
+        return [array.copy() for array in made]
+
+    return run
 
 
 def _open_torchscript(path: Path, table: Table) -> Run:

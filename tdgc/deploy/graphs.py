@@ -49,7 +49,7 @@ def _constant(value: ArrayLike) -> Tensor:
     return th.tensor(np.asarray(value, dtype=np.float64))
 
 
-_TURN, _HALF_TURN = _constant(2.0 * np.pi), _constant(np.pi)
+_TURN, _HALF_TURN, _HALF = _constant(2.0 * np.pi), _constant(np.pi), _constant(0.5)
 
 
 class Row:
@@ -129,8 +129,8 @@ def raw_phases(clock: Tensor, command: Commands) -> Tensor:
 def foot_phases(clock: Tensor, command: Commands) -> Tensor:
     """Warped phase of each foot, as ``gaits.foot_phases``: (1,) or (n, 1) -> (4,) or (n, 4)."""
     raw, duty = raw_phases(clock, command), command["duration"]
-    swing = 0.5 + (raw - duty) * (0.5 / (1.0 - duty))
-    return th.where(raw < duty, raw * (0.5 / duty), swing)
+    swing = 0.5 + (raw - duty) * (_HALF / (1.0 - duty))
+    return th.where(raw < duty, raw * (_HALF / duty), swing)
 
 
 class Pose(nn.Module):
@@ -151,11 +151,14 @@ class Pose(nn.Module):
         self.ahead = _constant(ahead)[:, None]
         geometry = read_geometry(robot)
         self.thigh, self.calf = geometry.thigh, geometry.calf
+        self.lengths = _constant([[geometry.thigh], [geometry.calf]])
         standing, _ = foot_kinematics(geometry, nominal[None], np.zeros((1, NUM_JOINTS)))
         hips = np.pad(geometry.hips, ((0, 0), (0, 1)))
         default = dict(zip(NAMES, default_command(), strict=True))
-        # Feet against their hips, without what the commands add.
-        x, y, z = (standing[0] - hips).T
+        self.hips_x, self.hips_y = map(_constant, geometry.hips.T)
+        # Feet without what the commands add, against the trunk to walk, which turns with them, or
+        # else against their hips.
+        x, y, z = (standing[0] if self.walks else standing[0] - hips).T
         self.x = _constant(x - 0.5 * default["stance_length"] * FRONT)
         self.y = _constant(y - 0.5 * default["stance_width"] * SIDE)
         lift = nominal_height(robot, geometry) - robot.base_height if self.walks else 0.0
@@ -164,7 +167,6 @@ class Pose(nn.Module):
         self.front, self.side = _constant(0.5 * FRONT), _constant(0.5 * SIDE)
         self.out = _constant(geometry.abduction * SIDE)
         self.lowest, self.highest = map(_constant, geometry.joint_limits[2::3].T)
-        self.hips_x, self.hips_y = map(_constant, geometry.hips.T)
         # A leg's peak load, as in ``robot.stance_load``, times its duty factor over the stiffness.
         weight = GRAVITY * sum(geometry.masses.values())
         self.load = _constant(0.125 * np.pi * weight / robot.kp)
@@ -180,24 +182,31 @@ class Pose(nn.Module):
         if not self.follows:
             return self.nominal
         # Rows of the four feet, (1, 4), here and below.
-        swing = (2.0 * phases[-1:] - 1.0).clamp(0.0, 1.0)
+        through = 2.0 * phases[-1:] - 1.0
+        swing = through.clamp(0.0, 1.0)
         raised = grown * (command["swing_height"] - self.default_swing) * th.sin(_HALF_TURN * swing)
         x = self.x + command["stance_length"] * self.front
         y = self.y + command["stance_width"] * self.side
         z = self.z - command["body_height"] + raised
         if self.walks:
-            pose = self._walk(x, y, z, phases, grown, command)
+            lead = (through.abs() - 0.5) * (grown * command["duration"] / command["frequency"])
+            pose = self._walk(x, y, z, lead, phases[1:2], command)
         else:
             pose = th.cat(self._angles(x, y, z))
         return pose.T.flatten()
 
     def _walk(
-        self, x: Tensor, y: Tensor, z: Tensor, phases: Tensor, grown: Tensor, command: Commands
+        self, x: Tensor, y: Tensor, z: Tensor, lead: Tensor, phases: Tensor, command: Commands
     ) -> Tensor:
-        """As ``robot.walking_pose``, from feet in m against their hips: (3, 4) rad."""
-        turn, duty = command["yaw_rate"], command["duration"]
-        lead = ((1.0 - 2.0 * phases[2:]).abs() - 0.5) * (grown * duty / command["frequency"])
-        x, y = x + self.hips_x, y + self.hips_y  # what turns about the trunk
+        """As ``robot.walking_pose``: (3, 4) rad.
+
+        Args:
+            x, y, z: (1, 4) m, feet against the trunk.
+            lead: (1, 4) s that the feet are ahead of the middle of their stance.
+            phases: (1, 4) in the middle of the control step.
+            command: the commands in force.
+        """
+        turn = command["yaw_rate"]
         x, y = x + lead * (command["vx"] - turn * y), y + lead * (command["vy"] + turn * x)
         pitch, roll = command["pitch"], command["roll"]
         cos, sin = th.cos(pitch), th.sin(pitch)
@@ -206,9 +215,10 @@ class Pose(nn.Module):
         y, z = cos * y + sin * z, cos * z - sin * y
         hip, thigh, calf = self._angles(x - self.hips_x, y - self.hips_y, z)
         # What the load on the feet does to the joints, as ``robot.load_torque``.
-        load = (self.load / duty) * th.sin(_TURN * phases[1:2]).clamp(min=0.0)
-        x_thigh, x_calf = self.thigh * th.sin(thigh), self.calf * th.sin(thigh + calf)
-        down = self.thigh * th.cos(thigh) + self.calf * th.cos(thigh + calf)
+        load = (self.load / command["duration"]) * th.sin(_TURN * phases).clamp(min=0.0)
+        bends = th.cat([thigh, thigh + calf])
+        ahead, down = self.lengths * th.sin(bends), (self.lengths * th.cos(bends)).sum(0)
+        x_thigh, x_calf = ahead.chunk(2)
         cos = th.cos(hip)
         rises = th.cat(
             [self.out * cos + down * th.sin(hip), (x_thigh + x_calf) * cos, x_calf * cos]
@@ -244,7 +254,6 @@ class LowGraph(nn.Module):
         self.actor = ClippedActor(policy)
         robot = config.robot
         self.dt = _constant(config.physics.control_dt)
-        self.limit = _constant(robot.action_limit)
         self.pose = Pose(robot, config.physics.control_dt)
         self.nominal = _constant(nominal_pose(robot))
         self.row = Row(actor_layout(config.robot, config.gyro))
@@ -263,7 +272,10 @@ class LowGraph(nn.Module):
         zero = observed_command(np.zeros(NUM_COMMANDS))
         self.command_zero = _constant(zero)
         self.command_gain = _constant(observed_command(np.ones(NUM_COMMANDS)) - zero)
-        self.gait_shares = _constant(np.arange(len(GAITS)) / (len(GAITS) - 1))
+        # The index of a gait is affine in its embedding, as there are four of them.
+        known = np.column_stack([np.ones(len(GAITS)), GAIT_TABLE])
+        first, *gain = np.linalg.solve(known, np.arange(len(GAITS)) / (len(GAITS) - 1))
+        self.gait_zero, self.gait_gain = _constant([first]), _constant(gain)
         self.inputs = [
             *_BODY,
             *([_GYRO] if config.gyro else []),
@@ -320,20 +332,14 @@ class LowGraph(nn.Module):
             "command": self.command_gain * command + self.command_zero,
             "clock": th.sin(_TURN * phases[:1].flatten()),
             "clock_cosine": th.cos(_TURN * phases[:1].flatten()),
-            "gait": self._gait(named),
+            "gait": self.gait_zero + command[12:] @ self.gait_gain,
         }
-        action = self.actor(self.row(terms)[None]).double().clamp(-self.limit, self.limit)
+        action = self.actor(self.row(terms)[None]).double()
         run = self.dt * named["frequency"]
         clock = clock + run
         targets = (pose + self.joint_scale * action).clamp(self.lowest, self.highest)
         step = (action, targets, clock - clock.floor())
         return (*step, cycles + run) if self.counted else step
-
-    def _gait(self, command: Commands) -> Tensor:
-        """Index of the gait as a share of the last one's, as the observation has it: (1,)."""
-        trot, pronk, pace, bound = self.gait_shares.unbind()
-        phase, offset, pairs = (command[name] > 0.25 for name in NAMES[12:])
-        return th.where(phase, trot, th.where(pairs, pace, th.where(offset, bound, pronk)))
 
 
 class HighGraph(nn.Module):

@@ -48,7 +48,7 @@ class Actor(nn.Module):
         if self.mirror is None:
             return x
         obs_index, obs_sign, _, _ = self.mirror
-        return th.cat([x, x[:, obs_index] * obs_sign])
+        return th.cat([x, x.index_select(1, obs_index) * obs_sign])
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         # A recurrent policy's LSTM has seen both sides already.
@@ -59,7 +59,7 @@ class Actor(nn.Module):
         if self.mirror is not None:
             _, _, action_index, action_sign = self.mirror
             seen, mirrored = x.chunk(2)
-            x = 0.5 * (seen + mirrored[:, action_index] * action_sign)
+            x = 0.5 * (seen + mirrored.index_select(1, action_index) * action_sign)
         return x
 
     def tensors(self) -> dict[str, th.Tensor]:
