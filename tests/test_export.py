@@ -232,7 +232,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(
     before the LSTM where the cues are whole."""
     narrow = dataclasses.replace(HIGH_CONFIG.commands, vx=(-0.5, 0.8), pitch=(0.0, 0.0))
     config = HighLevelConfig(
-        cues=cues, probes=probes, action_limit=2.0, decimation=4, commands=narrow, footholds=True
+        cues=cues, probes=probes, action_limit=2.0, decimation=4, commands=narrow
     )
     encoder = (24, 16) if cues == "both" else ()
     policy = policies.load(random_high(tmp_path / "high", config, encoder=encoder))
@@ -256,7 +256,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(
             high_layout(config),
             Seen(
                 loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
-                task.family_index, heights, late, closing, 0.08,
+                task.family_index, heights, late, closing,
             ),
         )  # fmt: skip
         wanted, (hidden, cell) = policy.predict(seen, (memory[:1], memory[1:]))

@@ -20,8 +20,7 @@ from tdgc.config import (
     RobotConfig,
     with_overrides,
 )
-from tdgc.sim.commands import INDEX, NAMES, CommandDecoder, default_command, gait_index
-from tdgc.sim.gaits import GAITS, gait_embedding
+from tdgc.sim.commands import NAMES, CommandDecoder, default_command, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import JOINTS, columns, width
 from tdgc.sim.robot import nominal_pose
@@ -29,16 +28,7 @@ from tdgc.sim.terrain import TILE_SIZE, make_tile
 from tdgc.tasks import rewards
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
-from tdgc.tasks.high_observation import (
-    GUIDANCE,
-    RHYTHMS,
-    SEMANTIC,
-    Seen,
-    high_layout,
-    high_mirror,
-    landing_places,
-    untold_column,
-)
+from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, high_layout, high_mirror, untold_column
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
@@ -181,49 +171,6 @@ def test_layout_and_cues():
     assert width(high_layout(dataclasses.replace(CONFIG, probe_age=False))) == 91
     assert width(high_layout(dataclasses.replace(CONFIG, closing_speed=False))) == 91
     assert SEMANTIC[-1] == "unknown"
-    ahead = dataclasses.replace(CONFIG, footholds=True)
-    sizes = [
-        width(high_layout(dataclasses.replace(ahead, **changes)))
-        for changes in (
-            {},
-            {"cues": "geometric"},
-            {"cues": "semantic"},
-            {"probes": "staggered"},
-            {"probe_age": False},
-        )
-    ]
-    assert sizes == [92 + 27, 86 + 27, 59, 92, 91]
-
-
-@pytest.mark.parametrize("gait", ["pronk", "trot", "bound"])
-def test_sees_the_ground_where_feet_would_land(task, gait):
-    """A quarter into the cycle of the front right foot; pronk lands all feet together, trot one
-    of either pair in a quarter of a cycle, bound the rear feet half a cycle before the front."""
-    loco = task.locomotion
-    command = default_command()
-    for name, value in (("vx", 0.9), ("duration", 0.6)):
-        command[INDEX[name]] = value
-    command[12:] = gait_embedding(GAITS.index(gait))
-    loco.command[:] = command
-    loco.clock.clock[:] = 0.25
-    loco.clock.update(loco.command[:, 12:], loco.command[:, INDEX["duration"]])
-    front, rear = {"pronk": (0.75, 0.75), "trot": (0.25, 0.25), "bound": (0.25, 0.75)}[gait]
-    probes = np.zeros((5, 32))
-    probes[:, :20] = np.arange(20)
-    late, rest = np.arange(5) % 2, 0.5 * default_command()[INDEX["stance_length"]]
-    seen = Seen(loco, *[None] * 4, probes, late, None, 0.1)
-    places = landing_places(seen)
-    fast, slow = 4, 0  # 3 Hz and 2 Hz
-    assert RHYTHMS[[slow, fast]] == pytest.approx([2.0, 3.0])
-    for k, stride in ((fast, 0.3), (slow, 0.45)):
-        expected = [stride * (front + 0.3) + rest, stride * (rear + 0.3) - rest]
-        expected.append(expected[0] + stride)
-        assert places[2, :, k] == pytest.approx(expected)
-    term = high_layout(dataclasses.replace(CONFIG, footholds=True))[-1]
-    # What is read late lies as much nearer as the trunk went in a decision, 9 cm.
-    index = (places + 0.09 * late[:, None, None] - 0.1) / 0.05
-    expected = np.clip(index, 0.0, 19.0).reshape(5, 27)
-    np.testing.assert_allclose(term.read(seen), expected, atol=1e-9)
 
 
 def test_sees_how_fast_the_goal_comes_nearer(task):
@@ -240,9 +187,7 @@ def test_sees_how_fast_the_goal_comes_nearer(task):
 @pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])
 def test_mirrored_robots_see_mirrored_things(cues):
     """A robot and its mirror image on a pillar's tile and on that tile mirrored."""
-    config = dataclasses.replace(
-        CONFIG, cues=cues, families=("pillar",), unknown_share=0.0, footholds=True
-    )
+    config = dataclasses.replace(CONFIG, cues=cues, families=("pillar",), unknown_share=0.0)
     task = NavigationTask(config, LOW, 2, seed=0, training=False)
     loco, state, rng = task.locomotion, task.locomotion.world.state, np.random.default_rng(0)
     tile = make_tile("pillar", 1.0, rng)

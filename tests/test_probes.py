@@ -17,7 +17,6 @@ from tdgc.tasks.probes import (
     PROBE_SWAP,
     PROBES,
     HeightProbes,
-    ground_ahead,
     height_probes,
 )
 
@@ -49,18 +48,6 @@ def test_they_are_the_same_on_both_sides_and_close_enough() -> None:
     np.testing.assert_allclose(np.diff(ahead), 0.05)
     assert ahead[0] == 0.1 and ahead[-1] == pytest.approx(1.05)
     np.testing.assert_allclose(np.unique(POINTS[:, 1]), [-0.4, -0.2, 0.0, 0.2, 0.4])
-
-
-def test_the_ground_ahead_is_interpolated_between_them() -> None:
-    heights = np.zeros((2, NUM_PROBES))
-    heights[0, :20] = POINTS[:20, 0]  # a ramp
-    heights[1, 9:11] = -0.4  # a trench of 10 cm, 0.55 m ahead
-    heights[:, 20:] = 9.0  # beside the robot
-    x = np.array([[0.0, 0.1, 0.333], [0.5, 0.525, 0.59]])
-    expected = [[0.1, 0.1, 0.333], [0.0, -0.2, -0.4]]
-    np.testing.assert_allclose(ground_ahead(heights, x), expected, atol=1e-12)
-    far = ground_ahead(heights, np.array([[1.05], [1.3]]))
-    np.testing.assert_allclose(far, [[1.05], [0.0]], atol=1e-12)
 
 
 def begun(loco: Locomotion, noise: Noise | None) -> HeightProbes:

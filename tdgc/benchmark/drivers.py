@@ -179,9 +179,9 @@ class HierarchyDriver(Driver):
         if config.cues in ("both", "semantic"):
             self.told = SEMANTIC[seen]
         self._sensor = HeightProbes(loco, PROBES[config.probes], noise)
-        self._seconds = config.decimation * loco.physics.control_dt
-        self._approach = Approach(loco, self._seconds)
-        self._horizon = round(config.episode_seconds / self._seconds)
+        seconds = config.decimation * loco.physics.control_dt
+        self._approach = Approach(loco, seconds)
+        self._horizon = round(config.episode_seconds / seconds)
         self._state: Any = None
         self._last = np.zeros((m, NUM_ACTIONS))
 
@@ -216,7 +216,6 @@ class HierarchyDriver(Driver):
             probes,
             self._sensor.late,
             self._approach.speed,
-            self._seconds,
         )
         return observe(high_layout(self.config), seen)
 

@@ -67,9 +67,6 @@ class HighLevelConfig:
     # Whether it sees how fast the goal came nearer since the last decision. A leap is timed by the
     # trunk's speed, which no sensor of the robot gives (docs/experiments.md).
     closing_speed: bool = field(default=True, metadata={"before": False})
-    # Whether it sees the ground where feet would land next, at several step frequencies: what the
-    # probes of ``lines``, their age and the gait clock say together (docs/experiments.md).
-    footholds: bool = field(default=False, metadata={"before": False})
     # Share of the episodes in training whose family is told as unknown, so that the probes alone
     # have to do: tiles of several families, or of none that has a name.
     unknown_share: Share = 0.2

@@ -40,8 +40,8 @@ from tdgc.sim.robot import (
     nominal_pose,
     target_limits,
 )
-from tdgc.tasks.high_observation import GOAL_SCALE, REACH, RHYTHMS, SEMANTIC, high_layout
-from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, STRAIGHT
+from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
+from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE
 
 
 def _constant(value: ArrayLike) -> Tensor:
@@ -119,16 +119,11 @@ def by_command(command: Tensor) -> Commands:
     return dict(zip(NAMES, command.chunk(NUM_COMMANDS), strict=True))
 
 
-def raw_phases(clock: Tensor, command: Commands) -> Tensor:
-    """As ``gaits.raw_phases``: (1,) or (n, 1) -> (4,) or (n, 4)."""
-    phase, offset, bound = (command[name] for name in NAMES[12:])
-    raw = clock + th.cat([phase + offset + bound, offset, bound, phase])
-    return raw - raw.floor()
-
-
 def foot_phases(clock: Tensor, command: Commands) -> Tensor:
     """Warped phase of each foot, as ``gaits.foot_phases``: (1,) or (n, 1) -> (4,) or (n, 4)."""
-    raw, duty = raw_phases(clock, command), command["duration"]
+    phase, offset, bound, duty = (command[name] for name in (*NAMES[12:], "duration"))
+    raw = clock + th.cat([phase + offset + bound, offset, bound, phase])
+    raw = raw - raw.floor()
     swing = 0.5 + (raw - duty) * (_HALF / (1.0 - duty))
     return th.where(raw < duty, raw * (_HALF / duty), swing)
 
@@ -366,13 +361,6 @@ class HighGraph(nn.Module):
         seconds = round(config.episode_seconds / step) * step
         self.seconds, self.step = _constant(seconds), _constant(step)
         self.ahead = _constant([1.0, 0.0])
-        self.foresees = any(term.name == "footholds" for term in layout)
-        self.rhythms = _constant(RHYTHMS)
-        self.reach = _constant([[REACH], [-REACH]])
-        ahead = STRAIGHT[:, 0]
-        self.number = _constant(np.arange(len(ahead)))
-        self.first, self.apart = _constant(ahead[0]), _constant(ahead[1] - ahead[0])
-        self.last = self.number[-1]
         start = tuple(default_command().tolist())
         family = "1 for the terrain under the robot, 0 for the others"
         probes = (
@@ -421,8 +409,7 @@ class HighGraph(nn.Module):
     def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
         """``inputs`` -> ``outputs``."""
         x = _by_name(self.inputs, values)
-        commands = by_command(x["last_commands"])
-        phases = _TURN * foot_phases(x["clock"], commands)
+        phases = _TURN * foot_phases(x["clock"], by_command(x["last_commands"]))
         goal = x["goal"]
         distance = (goal * goal).sum(0, keepdim=True).sqrt()
         direction = th.where(distance > 0.0, goal / distance, self.ahead)
@@ -443,27 +430,10 @@ class HighGraph(nn.Module):
             before = (x["last_goal"] * x["last_goal"]).sum(0, keepdim=True).sqrt()
             closing = (before - distance) / self.step
             terms["closing_speed"] = th.where(before > 0.0, closing, th.zeros_like(closing))
-        if self.foresees:
-            places = self._landing_places(raw_phases(x["clock"], commands), commands)
-            moved = x["probe_age"] * commands["vx"].clamp(min=0.0)
-            terms["footholds"] = self._ground_ahead(terms["probes"], places + moved)
         state = (x["hidden"].float()[None], x["cell"].float()[None])
         latent, (hidden, cell) = self.remember(self.row(terms)[None], state)
         decision = self.actor(latent).double()
         return decision, self._decode(decision), hidden[0].double(), cell[0].double()
-
-    def _landing_places(self, raw: Tensor, commands: Commands) -> Tensor:
-        """As ``high_observation.landing_places``: (3, 9) m."""
-        stride = commands["vx"].clamp(min=0.0) / self.rhythms
-        cycles = (1.0 - raw.view(2, 2)).amin(1, keepdim=True) + 0.5 * commands["duration"]
-        next_feet = stride * cycles + self.reach
-        return th.cat([next_feet, next_feet[:1] + stride])
-
-    def _ground_ahead(self, probes: Tensor, x: Tensor) -> Tensor:
-        """As ``probes.ground_ahead``: (n,) m."""
-        place = ((x.flatten()[:, None] - self.first) / self.apart).clamp(self.number[0], self.last)
-        near = (1.0 - (place - self.number).abs()).clamp(min=0.0)
-        return near @ probes[: len(self.number)]
 
     def _normalise(self, decision: Tensor) -> Tensor:
         return decision.clamp(-self.limit, self.limit) / self.limit

@@ -63,11 +63,6 @@ def gait_embedding(gait: ArrayLike) -> NDArray[np.float64]:
     return GAIT_TABLE[index]
 
 
-def raw_phases(clock: NDArray[np.floating], embedding: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Share of its cycle that each foot is through, 0 at touchdown: (M,), (M, 3) -> (M, 4)."""
-    return np.asarray(np.mod(clock[:, None] + embedding @ _FOOT_OFFSETS.T, 1.0))
-
-
 def foot_phases(
     clock: NDArray[np.floating], embedding: NDArray[np.floating], duration: NDArray[np.floating]
 ) -> NDArray[np.float64]:
@@ -76,7 +71,7 @@ def foot_phases(
     A foot is in stance while its raw phase is below ``duration`` (the duty factor); the warp
     stretches that to [0, 0.5) and the swing to [0.5, 1).
     """
-    raw = raw_phases(clock, embedding)
+    raw = np.mod(clock[:, None] + embedding @ _FOOT_OFFSETS.T, 1.0)
     duty = duration[:, None]
     stance = raw * (0.5 / duty)
     swing = 0.5 + (raw - duty) * (0.5 / (1.0 - duty))
@@ -150,10 +145,6 @@ class PhaseClock:
     def cosine(self) -> NDArray[np.float64]:
         """cos(2 pi phase) of each foot, (M, 4): the sine alone is the same twice in a cycle."""
         return np.cos(2.0 * np.pi * self.phases)
-
-    def touchdown(self) -> NDArray[np.float64]:
-        """Share of a cycle until each foot touches down next, (M, 4) in (0, 1]."""
-        return 1.0 - raw_phases(self.clock, self.embedding)
 
     def begun(self, cycles: float) -> NDArray[np.float64]:
         """Share that is over of a gait's first ``cycles``, (M,) in [0, 1]; 1 if these are 0."""

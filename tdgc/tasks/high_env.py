@@ -281,7 +281,6 @@ class NavigationTask:
                 self._probes.read(),
                 self._probes.late,
                 self._approach.speed,
-                self.step_seconds,
             ),
         )
         if self.teacher is None:

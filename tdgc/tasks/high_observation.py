@@ -9,23 +9,17 @@ from numpy.typing import NDArray
 
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig
 from tdgc.policies import Mirror
-from tdgc.sim.commands import CONTINUOUS, INDEX, NUM_ACTIONS, SIDEWAYS, default_command
+from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS
 from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
 from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, columns, in_place, mirror, width
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import FAMILIES
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
-from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP, ground_ahead
+from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP
 
 GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
 #: Width of what a teacher adds to an observation.
 GUIDANCE = NUM_ACTIONS + FREQUENCIES * LENGTHS
-
-#: Hz, step frequencies whose footholds are looked at: the commands' range, so closely that their
-#: footholds are about as far apart as the probes are.
-RHYTHMS = np.linspace(*CommandRanges().frequency, 9)
-#: m, how far ahead of the trunk or behind it feet are at rest.
-REACH = 0.5 * default_command()[INDEX["stance_length"]]
 
 #: The semantic cue: one-hot over the families, and one place for "unknown".
 SEMANTIC = (*FAMILIES, "unknown")
@@ -43,7 +37,6 @@ class Seen(NamedTuple):
         probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
         late: (M,) how many decisions ago those were measured.
         closing: (M,) m/s, how fast the goal came nearer since the last decision.
-        seconds: between two decisions.
     """
 
     loco: Locomotion
@@ -54,7 +47,6 @@ class Seen(NamedTuple):
     probes: Array
     late: NDArray[Any]
     closing: Array
-    seconds: float
 
 
 def _goal(seen: Seen) -> Array:
@@ -67,25 +59,6 @@ def _goal(seen: Seen) -> Array:
 
 def _joint_error(seen: Seen) -> Array:
     return seen.loco.world.state.q - seen.loco.joint_offset - seen.loco.nominal
-
-
-def landing_places(seen: Seen) -> Array:
-    """How far ahead feet would land next at each of ``RHYTHMS``, (M, 3, 9) m, if the robots go on
-    as commanded: the next front foot by Raibert's rule, the next rear foot, and the front one a
-    cycle later. The trunk's speed is not measured, so it is taken to be the commanded one."""
-    command, clock = seen.loco.command, seen.loco.clock
-    speed = np.maximum(command[:, INDEX["vx"]], 0.0)[:, None]
-    stride = speed / RHYTHMS
-    left = clock.touchdown().reshape(-1, 2, 2).min(axis=2)
-    cycles = left + 0.5 * command[:, INDEX["duration"], None]
-    front, rear = stride * cycles[:, :1] + REACH, stride * cycles[:, 1:] - REACH
-    return np.stack([front, rear, front + stride], axis=1)
-
-
-def _footholds(seen: Seen) -> Array:
-    moved = seen.late * seen.seconds * np.maximum(seen.loco.command[:, INDEX["vx"]], 0.0)
-    ground = ground_ahead(seen.probes, landing_places(seen) + moved[:, None, None])
-    return ground.reshape(len(ground), -1)
 
 
 _FLIP_ACTION = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in (*CONTINUOUS, "gait")))
@@ -102,7 +75,6 @@ _COSINE: Term[Seen] = Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), m
 _PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
 _AGE: Term[Seen] = Term("probe_age", 1, lambda s: s.late[:, None].astype(np.float64))
 _CLOSING: Term[Seen] = Term("closing_speed", 1, lambda s: s.closing[:, None])
-_FOOTHOLDS: Term[Seen] = Term("footholds", 3 * len(RHYTHMS), _footholds, 1.0 / PROBE_RANGE)
 _CUES: dict[str, Term[Seen]] = {
     "semantic": Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
     "geometric": Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
@@ -115,9 +87,7 @@ def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
     cues = [term for cue, term in _CUES.items() if config.cues in ("both", cue)]
     age = (_AGE,) if config.probe_age and config.cues in ("both", "geometric") else ()
     closing = (_CLOSING,) if config.closing_speed else ()
-    ahead = config.footholds and age and config.probes == "lines"
-    footholds = (_FOOTHOLDS,) if ahead else ()
-    return (*_LAYOUT, *clock, *cues, *age, *closing, *footholds)
+    return (*_LAYOUT, *clock, *cues, *age, *closing)
 
 
 def untold_column(config: HighLevelConfig) -> int | None:

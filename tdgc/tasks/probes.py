@@ -21,26 +21,8 @@ PROBES: dict[str, Array] = {
     "staggered": np.array([(0.05 * i - 0.25, (0.1, -0.3, 0.3, -0.1)[i % 4]) for i in range(32)]),
 }
 NUM_PROBES = 32
-#: The probes of ``lines`` straight ahead, which come first.
-STRAIGHT = PROBES["lines"][: len(_AHEAD)]
 #: Which of ``lines`` is each one's mirror image.
 PROBE_SWAP = (*range(20), *(20 + i + (1, -1)[i % 2] for i in range(12)))
-
-
-def ground_ahead(probes: Array, x: Array) -> Array:
-    """Heights straight ahead of M robots, interpolated between their probes.
-
-    Args:
-        probes: (M, 32) m, read at ``lines``.
-        x: (M, ...) m ahead; short of the first probe the ground is as there, beyond the last, too.
-
-    Returns:
-        (M, ...) m.
-    """
-    ahead, count = STRAIGHT[:, 0], len(STRAIGHT)
-    place = np.clip((x - ahead[0]) / (ahead[1] - ahead[0]), 0.0, count - 1.0)
-    near = np.maximum(1.0 - np.abs(place[..., None] - np.arange(count)), 0.0)
-    return np.asarray(np.einsum("m...i,mi->m...", near, probes[:, :count]))
 
 
 def height_probes(loco: Locomotion, points: Array) -> Array:
