@@ -181,6 +181,7 @@ def build_imitation(
         Apprentice, ApprenticePolicy, env, config, device,
         learning_rate=LinearRate(imitation.learning_rate, imitation.final_learning_rate),
         n_epochs=imitation.n_epochs,
+        kept=imitation.kept,
         batch_size=config.ppo.n_steps * config.n_envs // imitation.minibatches,
     )  # fmt: skip
     return model, env

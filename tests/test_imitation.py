@@ -15,11 +15,12 @@ from tdgc import policies
 from tdgc.learn.imitation import (
     Apprentice,
     ApprenticePolicy,
+    Notebook,
     TaughtPolicy,
     expected_price,
     imitation_loss,
 )
-from tdgc.learn.recurrent import FastRecurrentPPO
+from tdgc.learn.recurrent import FastRecurrentPPO, WholeEnvBuffer
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
 from tdgc.tasks.high_observation import GUIDANCE
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
@@ -58,7 +59,9 @@ def one_thread():
     th.set_num_threads(threads)
 
 
-def learner(kind: type[FastRecurrentPPO], policy: type[TaughtPolicy]) -> FastRecurrentPPO:
+def learner(
+    kind: type[FastRecurrentPPO], policy: type[TaughtPolicy], **keywords: int
+) -> FastRecurrentPPO:
     return kind(
         policy,
         DummyVecEnv([lambda i=i: Lesson(i) for i in range(ENVS)]),
@@ -70,6 +73,7 @@ def learner(kind: type[FastRecurrentPPO], policy: type[TaughtPolicy]) -> FastRec
         seed=0,
         device="cpu",
         policy_kwargs={"lstm_hidden_size": 16, "net_arch": [16], "log_std_init": -2.0},
+        **keywords,
     )
 
 
@@ -96,6 +100,74 @@ def test_an_apprentice_learns_what_it_is_taught_and_keeps_its_noise(apprentice) 
     assert first > 0.03  # of labels with a variance of 0.083
     assert error(apprentice) < 0.15 * first
     assert th.equal(apprentice.policy.log_std, noise)
+
+
+def fill(rollout: WholeEnvBuffer, observations: np.ndarray, mark: float) -> None:
+    """Make ``rollout`` one of ``observations`` (STEPS, ENVS, size), with ``mark`` in all else."""
+    rollout.observations[:] = observations
+    rollout.episode_starts[:] = np.arange(STEPS)[:, None] == 3
+    rollout.returns[:] = mark + np.arange(ENVS)
+    for k, memory in enumerate(
+        (
+            rollout.hidden_states_pi, rollout.cell_states_pi,
+            rollout.hidden_states_vf, rollout.cell_states_vf,
+        )
+    ):  # fmt: skip
+        memory[:] = 100.0 * k + mark + np.arange(ENVS)[:, None]
+
+
+def test_a_notebook_keeps_the_last_rollouts_and_mixes_them(apprentice) -> None:
+    """Each batch has a robot's sequence of one rollout, with the memory it began with."""
+    apprentice.learn(1)
+    rollout, notebook = apprentice.rollout_buffer, Notebook(3)
+    for number in range(5):
+        fill(rollout, np.full(rollout.observations.shape, 10.0 * number), 10.0 * number)
+        notebook.add(rollout)
+    np.random.seed(0)
+    seen = []
+    for _ in range(50):
+        first, second = notebook.batches(2)
+        assert len(first.returns) == len(second.returns) == ENVS // 2
+        values = th.cat([first.returns, second.returns])
+        assert sorted((values[:, 0] % 10).tolist()) == list(range(ENVS))
+        for batch in (first, second):
+            assert batch.observations.shape == (2, STEPS, SEEN + GUIDANCE)
+            assert (batch.observations == 10 * (batch.returns[..., None] // 10)).all()
+            assert (batch.starts[:, 3] == 1.0).all() and batch.starts.sum() == 2.0
+            for k in range(4):
+                assert (batch.memories[k] == 100.0 * k + batch.returns[:, :1]).all()
+        seen += (values[:, 0] // 10).tolist()
+    assert sorted(set(seen)) == [2.0, 3.0, 4.0]  # the last three of five
+    assert min(seen.count(number) for number in (2.0, 3.0, 4.0)) > 0.25 * len(seen)
+    other = Notebook(3)
+    other.restore(notebook.tensors())
+    np.random.seed(1)
+    expected = list(notebook.batches(1))
+    np.random.seed(1)
+    for batch, wanted in zip(other.batches(1), expected, strict=True):
+        assert all(th.equal(part, same) for part, same in zip(batch, wanted, strict=True))
+
+
+def test_what_is_kept_is_not_forgotten() -> None:
+    """Two robots' lessons, one after the other; then the first is asked again."""
+    left = {}
+    for kept in (1, 20):
+        model = learner(Apprentice, ApprenticePolicy, kept=kept)
+        model.learn(1)
+        rng, rollout = np.random.default_rng(0), model.rollout_buffer
+        lessons = []
+        for sign in (1.0, -1.0):
+            seen = rng.uniform(0.0, 1.0, (STEPS, ENVS, SEEN))
+            taught = np.repeat(0.5 * seen[..., :1], NUM_ACTIONS, axis=2)
+            price = np.zeros((STEPS, ENVS, GUIDANCE - NUM_ACTIONS))
+            lessons.append(np.concatenate([sign * seen, taught, price], axis=2))
+        for lesson in lessons:
+            for _ in range(10):
+                fill(rollout, lesson, 0.0)
+                model.train()
+        fill(rollout, lessons[0], 0.0)
+        left[kept] = error(model)
+    assert left[20] < 0.2 * left[1], left
 
 
 def test_reinforcement_learning_goes_on_imitating_as_far_as_it_is_told_to() -> None:

@@ -28,7 +28,7 @@ from tdgc.errors import InputError
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
-_VERSION = 8  # since decisions whose strides have a price weigh more in imitation
+_VERSION = 9  # since imitation learns from rollouts that it keeps
 #: Names of what the recurrent learner remembers of the episodes under way.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
@@ -65,6 +65,9 @@ class Checkpoint:
         memory: RNNStates | None = getattr(model, "_last_lstm_states", None)
         if memory is not None:
             tensors |= zip(_LSTM, (*memory.pi, *memory.vf), strict=True)
+        notebook = getattr(model, "notebook", None)
+        if notebook is not None:
+            tensors |= notebook.tensors()
         arrays: dict[str, NDArray[Any]] = {}
         extra = split(extra, "extra", arrays)
         tensors |= {name: th.from_numpy(array) for name, array in arrays.items()}
@@ -171,6 +174,9 @@ class Checkpoint:
         if _LSTM[0] in tensors:
             h_pi, c_pi, h_vf, c_vf = (tensors[name].to(model.device) for name in _LSTM)
             cast(Any, model)._last_lstm_states = RNNStates(pi=(h_pi, c_pi), vf=(h_vf, c_vf))
+        notebook = getattr(model, "notebook", None)
+        if notebook is not None:
+            notebook.restore(tensors)
         model.num_timesteps = self.steps
         model._n_updates = int(self.header["n_updates"])
         _restore_random(tensors, self.header["random"])

@@ -9,14 +9,17 @@ mean of two ways over a trench, which leads into it. The critic learns what thes
 so that PPO goes on with a critic that knows the policy.
 """
 
-from typing import Any, cast
+from collections import deque
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from torch import nn
 
-from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
+from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, WholeEnvBuffer
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
 from tdgc.tasks.high_observation import GUIDANCE
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
@@ -26,6 +29,7 @@ _STRIDE = [INDEX["frequency"], INDEX["stance_length"]]
 # action, what is left of that error of a stride that has a price, and what a decision whose stride
 # has one weighs against others: an error in it leads into a trench, elsewhere most are forgiven.
 _PRICE_WEIGHT, _PRICED, _LEAP_WEIGHT = 10.0, 0.1, 4.0
+_NOTES = "notebook."  # what names in a checkpoint begin with
 
 
 class TaughtPolicy(FastRecurrentPolicy):
@@ -99,26 +103,116 @@ def imitation_loss(mean: th.Tensor, guidance: th.Tensor, limit: float) -> th.Ten
     return th.where(priced, _LEAP_WEIGHT, 1.0) * loss
 
 
+class Lessons(NamedTuple):
+    """Rollouts of ``n`` robots, ``steps`` decisions long, sequence by sequence.
+
+    Attributes:
+        observations: (n, steps, size) with the teacher's guidance, float16.
+        starts: (n, steps), 1 where an episode begins.
+        returns: (n, steps).
+        memories: (4, n, hidden) before the first decision: h and c of the actor and the critic.
+    """
+
+    observations: th.Tensor
+    starts: th.Tensor
+    returns: th.Tensor
+    memories: th.Tensor
+
+
+class Notebook:
+    """The last rollouts, so that what is learned from one is not forgotten over the next.
+
+    A sequence starts with the memory that the apprentice had when it acted, though by now it might
+    have another (Kapturowski et al. 2019, R2D2, "stored state").
+
+    Args:
+        kept: how many rollouts.
+    """
+
+    def __init__(self, kept: int) -> None:
+        self._rollouts: deque[Lessons] = deque(maxlen=kept)
+
+    def add(self, rollout: WholeEnvBuffer) -> None:
+        """Keep a rollout, and drop the oldest of too many."""
+        observations, starts, returns = (
+            th.from_numpy(array.swapaxes(0, 1).copy())
+            for array in (rollout.observations, rollout.episode_starts, rollout.returns)
+        )
+        memories = [
+            th.from_numpy(array[0, 0].copy())
+            for array in (
+                rollout.hidden_states_pi, rollout.cell_states_pi,
+                rollout.hidden_states_vf, rollout.cell_states_vf,
+            )
+        ]  # fmt: skip
+        self._rollouts.append(Lessons(observations.half(), starts, returns, th.stack(memories)))
+
+    def batches(self, count: int) -> Iterator[Lessons]:
+        """``count`` minibatches: each robot once, in random order and from any rollout."""
+        robots = len(self._rollouts[0].returns)
+        for drawn in np.array_split(np.random.permutation(robots), count):
+            which = np.random.randint(len(self._rollouts), size=len(drawn))
+            pages = [(self._rollouts[k], i) for k, i in zip(which, drawn, strict=True)]
+            yield Lessons(
+                th.stack([page.observations[i] for page, i in pages]),
+                th.stack([page.starts[i] for page, i in pages]),
+                th.stack([page.returns[i] for page, i in pages]),
+                th.stack([page.memories[:, i] for page, i in pages], dim=1),
+            )
+
+    def tensors(self) -> dict[str, th.Tensor]:
+        """All of it by name, for a checkpoint."""
+        return {
+            f"{_NOTES}{number}.{name}": tensor
+            for number, lessons in enumerate(self._rollouts)
+            for name, tensor in lessons._asdict().items()
+        }
+
+    def restore(self, tensors: Mapping[str, th.Tensor]) -> None:
+        """What ``tensors`` gave; other names are passed over."""
+        self._rollouts.clear()
+        number = 0
+        while f"{_NOTES}{number}.returns" in tensors:
+            parts = (tensors[f"{_NOTES}{number}.{name}"] for name in Lessons._fields)
+            self._rollouts.append(Lessons(*parts))
+            number += 1
+
+
 class Apprentice(FastRecurrentPPO):
-    """``FastRecurrentPPO`` that learns what the teacher asks for instead of better actions."""
+    """``FastRecurrentPPO`` that learns what the teacher asks for instead of better actions.
+
+    Args:
+        kept: rollouts that it learns from, the newest ones.
+    """
+
+    def __init__(self, *args: Any, kept: int = 1, **kwargs: Any) -> None:
+        self.notebook = Notebook(kept)
+        super().__init__(*args, **kwargs)
 
     def train(self) -> None:
         """One update: ``imitation_loss``, and the critic's squared error."""
         policy = cast(ApprenticePolicy, self.policy)
         policy.set_training_mode(True)
         self._update_learning_rate(policy.optimizer)
+        rollout = cast(WholeEnvBuffer, self.rollout_buffer)
+        self.notebook.add(rollout)
+        minibatches = rollout.buffer_size * rollout.n_envs // cast(int, self.batch_size)
         losses, value_losses = [], []
         for _ in range(self.n_epochs):
-            for batch in self.rollout_buffer.get(self.batch_size):
-                observations = batch.observations
-                mean, values = policy.unroll(
-                    observations, cast(Any, batch).lstm_states, cast(Any, batch).episode_starts
+            for batch in self.notebook.batches(minibatches):
+                observations, starts, returns = (
+                    part.flatten(0, 1).to(self.device, th.float32) for part in batch[:3]
                 )
+                h_pi, c_pi, h_vf, c_vf = batch.memories.to(self.device)[:, None]
+                memories = RNNStates((h_pi, c_pi), (h_vf, c_vf))
+                mean, values = policy.unroll(observations, memories, starts)
                 imitation = policy.error(observations, mean).mean()
-                value_loss = nn.functional.mse_loss(values.flatten(), batch.returns)
+                value_loss = nn.functional.mse_loss(values.flatten(), returns)
                 policy.optimizer.zero_grad()
-                loss = imitation + self.vf_coef * value_loss
-                loss.backward()  # type: ignore[no-untyped-call]
+                imitation.backward()  # type: ignore[no-untyped-call]
+                # The actor's gradient alone: the critic, which shares no parameter, has none yet.
+                nn.utils.clip_grad_norm_(policy.parameters(), self.max_grad_norm)
+                (self.vf_coef * value_loss).backward()  # type: ignore[no-untyped-call]
                 policy.optimizer.step()
                 losses.append(imitation.item())
                 value_losses.append(value_loss.item())
