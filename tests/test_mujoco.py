@@ -263,6 +263,9 @@ def test_a_log_has_what_the_simulator_knows_but_its_truth(
         "error_roll",
     ]
     exact += [f"probe_{k:02d}" for k in range(32)] + ["seconds"]
+    if seen["seconds"][-1] < 1.5 * controller.dt:  # no second step says how far the clock went
+        assert np.isnan(seen["command_frequency"][-2])
+        seen["command_frequency"][-2] = truth["command_frequency"][-2]
     for name in exact:
         assert seen[name][:-1] == pytest.approx(truth[name][:-1], abs=1e-4, nan_ok=True), name
     for name in ("gait", "family"):

@@ -294,7 +294,9 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
     )
     command = seen["commands"][begin]
     fill(slice(-1), action_columns(seen["decision"][begin]))
-    carried_out = command.copy()  # a gait may begin faster than asked: how far the clock went
+    # A gait may begin faster than asked: how far the clock went, which nobody knows (NaN) of a
+    # decision whose first step was the last of all.
+    carried_out = command.copy()
     went = np.append(np.mod(np.diff(seen["clock"][:-1, 0]), 1.0), [np.nan] * 2)
     carried_out[:, INDEX["frequency"]] = went[begin] / controller.dt
     fill(slice(-1), command_columns(command, carried_out, controller.bounds))
