@@ -135,17 +135,11 @@ class Notebook:
     def add(self, rollout: WholeEnvBuffer) -> None:
         """Keep a rollout, and drop the oldest of too many."""
         observations, starts, returns = (
-            th.from_numpy(array.swapaxes(0, 1).copy())
+            rollout.by_env(array)
             for array in (rollout.observations, rollout.episode_starts, rollout.returns)
         )
-        memories = [
-            th.from_numpy(array[0, 0].copy())
-            for array in (
-                rollout.hidden_states_pi, rollout.cell_states_pi,
-                rollout.hidden_states_vf, rollout.cell_states_vf,
-            )
-        ]  # fmt: skip
-        self._rollouts.append(Lessons(observations.half(), starts, returns, th.stack(memories)))
+        memories = rollout.first_memories()[:, 0]
+        self._rollouts.append(Lessons(observations.half(), starts, returns, memories))
 
     def batches(self, count: int) -> Iterator[Lessons]:
         """``count`` minibatches: each robot once, in random order and from any rollout."""

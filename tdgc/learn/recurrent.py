@@ -297,31 +297,20 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
         """Minibatches of about ``batch_size`` steps, each environment once, in random order."""
         total = self.n_envs * self.buffer_size
         minibatches = total // (batch_size or total)
-
-        def by_env(array: NDArray[np.float32]) -> th.Tensor:
-            """(n_steps, n_envs, ...) -> (n_envs, n_steps, ...)."""
-            return self.to_torch(array.swapaxes(0, 1))
-
         steps = [
-            by_env(array)
+            self.by_env(array)
             for array in (
                 self.observations, self.actions, self.values, self.log_probs, self.advantages,
                 self.returns, self.episode_starts,
             )
         ]  # fmt: skip
-        states = [
-            self.to_torch(array[0])  # before the first of (n_steps, 1, n_envs, hidden)
-            for array in (
-                self.hidden_states_pi, self.cell_states_pi,
-                self.hidden_states_vf, self.cell_states_vf,
-            )
-        ]  # fmt: skip
+        states = self.first_memories()
         for drawn in np.array_split(np.random.permutation(self.n_envs), minibatches):
             envs = self.to_torch(drawn)
             obs, actions, values, log_probs, advantages, returns, starts = (
                 array.index_select(0, envs).flatten(0, 1) for array in steps
             )
-            h_pi, c_pi, h_vf, c_vf = (state.index_select(1, envs) for state in states)
+            h_pi, c_pi, h_vf, c_vf = states.index_select(2, envs)
             yield RecurrentRolloutBufferSamples(
                 observations=obs,
                 actions=actions,
@@ -333,6 +322,21 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
                 episode_starts=starts,
                 mask=cast(th.Tensor, _Everything()),
             )
+
+    def by_env(self, array: NDArray[np.float32]) -> th.Tensor:
+        """(n_steps, n_envs, ...) -> (n_envs, n_steps, ...)."""
+        return self.to_torch(array.swapaxes(0, 1))
+
+    def first_memories(self) -> th.Tensor:
+        """(4, 1, n_envs, hidden) before the first step: h and c of the actor and the critic."""
+        first = [
+            array[0]
+            for array in (
+                self.hidden_states_pi, self.cell_states_pi,
+                self.hidden_states_vf, self.cell_states_vf,
+            )
+        ]  # fmt: skip
+        return self.to_torch(np.stack(first))
 
 
 class FastRecurrentPPO(RecurrentPPO):
