@@ -69,13 +69,14 @@ def test_the_feed_forward_variant_has_as_many_parameters() -> None:
         ppo = with_overrides(HighTrainConfig(), variant.settings or ()).ppo
         policy = FastRecurrentPolicy(
             task.observation_space, task.action_space, lambda _: 0.0,
-            lstm_hidden_size=ppo.lstm, net_arch={"pi": list(ppo.actor), "vf": list(ppo.critic)},
+            lstm_hidden_size=ppo.lstm, encoder=ppo.encoder,
+            net_arch={"pi": list(ppo.actor), "vf": list(ppo.critic)},
         )  # fmt: skip
         of_learning = (p for name, p in policy.named_parameters() if "bias_hh" not in name)
         counts.append(sum(p.numel() for p in of_learning))
     task.close()
-    assert counts[0] == 45_197 + 44_417 + NUM_ACTIONS
-    assert counts[1] == 45_183 + 44_403 + NUM_ACTIONS
+    assert counts[0] == 74_509 + 73_729 + NUM_ACTIONS
+    assert counts[1] == 74_542 + 73_762 + NUM_ACTIONS
 
 
 # ------------------------------------------------------------------ the table

@@ -375,7 +375,7 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     assert train_low.main([*TINY, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     names = sorted(path.name for path in (whole / "checkpoints").iterdir())
     assert names == ["step-000000000160"]
-    assert [row["steps"] for row in rows(whole)] == [64, 128]
+    assert [row["steps"] for row in rows(whole)] == [64, 128, 160]
     assert all(row["memory/mb"] > 100.0 for row in rows(whole))
     assert rows(whole)[1]["reward/track_lin_vel"] > 0.0 and "level/stair" in rows(whole)[1]
     stored = from_dict(LowTrainConfig, json.loads((whole / "config.json").read_text()))
@@ -435,15 +435,16 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert (
         train_high.main([*arguments, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     )
-    assert [row["steps"] for row in rows(whole)] == [16, 32]
+    assert [row["steps"] for row in rows(whole)] == [16, 32, 40]
     # What imitation gave stays beside what came of it.
     imitated, learned = (policies.load(whole / name) for name in ("imitation", "policy"))
     assert (imitated.meta["steps"], learned.meta["steps"]) == (16, 40)
     # Levels are drawn while imitating; then all are the hardest, and no episode has ended yet.
     assert [rows(whole)[1][f"level/{family}"] for family in ("rough", "pillar")] == [10.0, 10.0]
-    # Half way from 2e-3 to 2e-4 in imitation; after 24 of 40 steps from 1.5e-4 to 5e-5.
+    # Half way from 2e-3 to 2e-4 in imitation; after 24 of 40 steps and in the end from 1.5e-4 to
+    # 5e-5.
     rates = [row["train/learning_rate"] for row in rows(whole)]
-    assert rates == pytest.approx([1.1e-3, 5e-5 + 0.4 * 1e-4])
+    assert rates == pytest.approx([1.1e-3, 5e-5 + 0.4 * 1e-4, 5e-5])
     last = broken / "checkpoints/step-000000000024"
     with monkeypatch.context() as patch:
         at_calls(patch, lambda call, run: setattr(run, "reason", "a test" if call == 2 else None))
@@ -479,7 +480,8 @@ def test_from_scratch_on_terrain_of_ones_own(
     np.save(bumps, 0.1 * np.sin(2.0 * np.pi * x / 1.6) * np.cos(2.0 * np.pi * y / 1.6))
     arguments = [
         "--no-teacher", "--seed", "3", "--n-envs", "4", "--workers", "1", "--steps", "96",
-        "--set", f'env.families=["{bumps}"]', "--set", "ppo.lstm=null", "--set", "log_steps=32",
+        "--set", f'env.families=["{bumps}"]', "--set", "ppo.lstm=null", "--set", "ppo.encoder=[]",
+        "--set", "log_steps=32",
         "--set", "ppo.n_steps=8", "--set", "ppo.minibatches=2", "--set", "ppo.n_epochs=2",
         "--set", "env.episode_seconds=1.3",
     ]  # fmt: skip
@@ -654,7 +656,7 @@ def test_flags_and_folders_that_cannot_be_used(
     ):
         assert train_high.main(["--set", setting, "--out", str(empty)]) == 2
         assert capsys.readouterr().err.startswith(f"train_high.py: {message}")
-    alone = ["--set", "ppo.lstm=null", "--set", "ppo.encoder=[8]"]
+    alone = ["--set", "ppo.lstm=null"]
     assert train_high.main([*alone, "--out", str(empty)]) == 2
     assert "'ppo.encoder' must be [] where 'ppo.lstm' is null" in capsys.readouterr().err
     assert not empty.exists()

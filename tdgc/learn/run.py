@@ -248,7 +248,7 @@ class RunCallback(BaseCallback):
     def _on_rollout_end(self) -> None:
         self._bar.update(self.num_timesteps - self._bar.n)
         if self.num_timesteps - self._logged_at[0] >= self.run.config.log_steps:
-            self._log()
+            self.log()
 
     def save(self) -> Checkpoint:
         """Write the policy and a checkpoint, or tell why not; returns the checkpoint."""
@@ -276,13 +276,16 @@ class RunCallback(BaseCallback):
         policy = cast(ActorCriticPolicy, self.model.policy)
         policies.save(self.run.folder / name, policy, {**self.run.meta, **progress})
 
-    def _log(self) -> None:
+    def log(self) -> None:
+        """Write a row about the steps since the last one, if there are any."""
+        steps, seconds = self._logged_at
+        if steps == self.num_timesteps:
+            return
         sums: dict[str, float] = {}
         for part in self.env.stats():
             for key, value in part.items():
                 sums[key] = sums.get(key, 0.0) + value
         values = self.run.summarise(sums)
-        steps, seconds = self._logged_at
         values["time/steps_per_s"] = (self.num_timesteps - steps) / (self.seconds - seconds)
         lengths = [e["l"] for e in self.model.ep_info_buffer or ()]
         if lengths:
@@ -373,6 +376,7 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
             model._update_current_progress_remaining(model.num_timesteps, until)
             model.train()
             updated_at = model.num_timesteps
+        callback.log()
     except WorkerError:
         model.num_timesteps = updated_at  # nothing was learned from the steps since
         raise
