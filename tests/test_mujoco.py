@@ -306,6 +306,18 @@ def holed(array: np.ndarray, row: int) -> np.ndarray:
     return array
 
 
+def test_nobody_knows_how_far_the_clock_went_in_a_last_step(
+    controller: Controller, slipped: tuple[trace.Trace, Path], tmp_path: Path
+) -> None:
+    """A log that ends a step after a decision, its last row without what would have followed."""
+    short = {name: array[:62] for name, array in np.load(slipped[1]).items()}
+    short |= {name: holed(short[name], 61) for name in log.GIVEN}
+    path = edited(slipped[1], tmp_path / "short.npz", **short)
+    frequency = log.trace(log.read(path, controller), controller, "fell")["command_frequency"]
+    assert len(frequency) == 14 and np.isnan(frequency[-2])
+    assert frequency[:-2] == pytest.approx(slipped[0]["command_frequency"][:12], abs=1e-4)
+
+
 def test_a_log_with_gaps_is_refused(
     controller: Controller, slipped: tuple[trace.Trace, Path], tmp_path: Path
 ) -> None:

@@ -113,9 +113,9 @@ class ImitationConfig:
     steps: Whole = 640_000  # decisions altogether; 0 leaves everything to reinforcement learning
     learning_rate: Positive = 2e-3
     final_learning_rate: Positive = 2e-4  # reached linearly at the last of the steps
-    # How little a frequency costs more than the teacher's depends on the updates that there were:
-    # 0.19, 0.15 and 0.12 after 1, 4 and 10 thousand of them on the same 90,000 decisions
-    # (docs/experiments.md). An update takes a tenth of the time of the decisions behind it.
+    # Of each rollout 48 updates of half as many decisions. How little a frequency costs more than
+    # the teacher's depends on the updates that there were: 0.19, 0.15 and 0.12 after 1, 4 and 10
+    # thousand of them on the same 90,000 decisions (docs/experiments.md).
     n_epochs: Count = 24
     minibatches: Count = field(default=2, metadata={"before": 4})
     # Rollouts that it learns from, each minibatch from all of them. Of the newest alone students
