@@ -28,11 +28,19 @@ from tdgc.sim.terrain import TILE_SIZE, make_tile
 from tdgc.tasks import rewards
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
-from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, high_layout, high_mirror, untold_column
+from tdgc.tasks.high_observation import (
+    GUIDANCE,
+    GUIDANCE_PARTS,
+    SEMANTIC,
+    high_layout,
+    high_mirror,
+    untold_column,
+)
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rewards import HighStep
+from tdgc.tasks.teacher import WAY
 
 LOW = PRETRAINED / "low"
 POINTS = PROBES["lines"]
@@ -449,6 +457,35 @@ def test_robots_begin_spread_over_the_first_levels():
     task.load_state_dict(state)
     assert task.curriculum.levels.tolist() == task.tiles.level.tolist() == levels
     task.close()
+
+
+def test_a_teacher_shows_the_second_way_around_pillars():
+    """As what it differs in from the first, in actions."""
+    task = NavigationTask(
+        dataclasses.replace(CONFIG, families=("pillar",)), LOW, 40, 0, taught=True
+    )
+    try:
+        task.curriculum.levels[:] = 9
+        task.reset(np.arange(40))
+        task.locomotion.place(
+            np.arange(40),
+            np.array([task.field.features[i, 0].pillars[0, :2] for i in range(40)])
+            + task._origin
+            - [0.5, 0.0],
+            np.zeros(40),
+            np.zeros(40),
+        )
+        guidance = task.observe()[:, width(high_layout(CONFIG)) :].astype(float)
+        taught, aside, dearer, _ = np.split(
+            guidance, np.cumsum([*GUIDANCE_PARTS.values()])[:-1], axis=1
+        )
+        second = dearer[:, 0] > 0.0
+        assert 5 < second.sum() < 40
+        assert (np.abs(aside[second]).max(axis=1) > 0.5).all() and not aside[~second].any()
+        taught[:, WAY] += aside
+        np.testing.assert_allclose(task.decoder.decode(taught), task.teacher.other, atol=1e-6)
+    finally:
+        task.close()
 
 
 def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():

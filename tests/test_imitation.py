@@ -24,6 +24,7 @@ from tdgc.learn.recurrent import FastRecurrentPPO, WholeEnvBuffer
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
 from tdgc.tasks.high_observation import GUIDANCE
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
+from tdgc.tasks.teacher import WAY
 
 SEEN, ENVS, STEPS = 5, 4, 16
 
@@ -207,7 +208,9 @@ FREE = np.zeros((FREQUENCIES, LENGTHS))
 
 
 def guidance(taught: float, price: np.ndarray) -> th.Tensor:
-    return th.tensor([*np.full(NUM_ACTIONS, taught), *price.ravel()], dtype=th.float32)[None]
+    """Without a second way around."""
+    parts = [np.full(NUM_ACTIONS, taught), np.zeros(len(WAY) + 1), price.ravel()]
+    return th.tensor(np.concatenate(parts), dtype=th.float32)[None]
 
 
 def test_between_two_ways_over_a_trench_a_student_takes_one() -> None:
@@ -257,6 +260,32 @@ def test_the_price_of_a_stride(limit: float) -> None:
     assert price(along_f) == pytest.approx(3.0 * 0.625, abs=1e-3)
     assert price(along_l) == pytest.approx(0.4, abs=2e-3)
     assert price(along_f + along_l) == pytest.approx(3.0 * 0.625 + 0.4, abs=3e-3)
+
+
+def test_between_two_ways_around_a_pillar_a_student_takes_one() -> None:
+    """The teacher goes left as often as right and says how much longer the other way is; a student
+    that cannot tell which is shorter goes all the way to one side, not on between them."""
+    side, turn = INDEX["vy"], INDEX["yaw_rate"]
+    asked = th.cat([guidance(0.0, FREE), guidance(0.0, FREE)])
+    way = th.tensor([0.8, -0.8])
+    asked[:, side], asked[:, turn] = way, way
+    for name, doubled in (("vx", 0.0), ("vy", -2.0), ("yaw_rate", -2.0)):
+        asked[:, NUM_ACTIONS + WAY.index(INDEX[name])] = doubled * way
+    asked[:, NUM_ACTIONS + len(WAY)] = dearer = 0.3
+
+    def loss(to: float) -> th.Tensor:
+        mean = th.zeros(2, NUM_ACTIONS)
+        mean[:, [side, turn]] = to
+        return imitation_loss(mean, asked, 1.0)
+
+    expected = th.tensor([0.0, dearer]) / NUM_ACTIONS
+    th.testing.assert_close(loss(0.8), expected)
+    th.testing.assert_close(loss(-0.8), expected.flip(0))
+    th.testing.assert_close(loss(0.0), th.full((2,), 2 * 0.8**2 / NUM_ACTIONS))
+    th.testing.assert_close(loss(0.7)[0], th.tensor(2 * 0.1**2 / NUM_ACTIONS))
+    tried = np.linspace(-1.0, 1.0, 81)
+    best = tried[int(np.argmin([float(loss(to).mean()) for to in tried]))]
+    assert abs(best) == pytest.approx(0.8, abs=0.03)
 
 
 def test_without_a_price_it_is_the_mean_square() -> None:

@@ -10,7 +10,7 @@ from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.terrain import Features, TileField, make_tile
 from tdgc.tasks.leaps import SWING_HEIGHT, Landing
-from tdgc.tasks.teacher import SIGHT, STYLES, UNEVEN, Teacher, travel_cost
+from tdgc.tasks.teacher import SIGHT, STYLES, UNEVEN, WAY, Teacher, travel_cost
 
 
 def test_travel_cost_in_the_open_is_the_way_of_a_king() -> None:
@@ -137,6 +137,28 @@ def test_goes_around_a_pillar(course) -> None:
     assert course.commands()[0, INDEX["yaw_rate"]] < -0.5
     course.put(4.0)  # behind it
     assert abs(course.commands()[0, INDEX["yaw_rate"]]) < 0.2
+
+
+def test_knows_both_ways_around_what_stands_before_it(course) -> None:
+    course = course(["pillar", "stair"])
+    pillars = np.array([[3.05, 4.0, 0.4], [3.05, 4.7, 0.3], [3.05, 3.4, 0.3]])
+    course.field.features[0, 0] = Features(pillars=pillars)  # a wall, shorter to the right
+    course.teacher.begin(np.arange(2), course.goal)
+    course.put(2.5)
+    command, straight_on = course.commands()
+    other, same = course.teacher.other
+    assert command[INDEX["vy"]] < -0.3 and command[INDEX["yaw_rate"]] < -0.5
+    assert other[INDEX["vy"]] > 0.3 and other[INDEX["yaw_rate"]] > 0.5
+    np.testing.assert_array_equal(np.delete(other, WAY), np.delete(command, WAY))
+    # Around the wall's ends, 0.28 m from its pillars: 0.2 m more on the left, at up to 3 a metre.
+    assert 0.1 < course.teacher.dearer[0] < 0.6
+    np.testing.assert_array_equal(same, straight_on)
+    assert course.teacher.dearer[1] == 0.0
+    for x in (1.0, 4.0):  # afar and behind there is but one way
+        course.put(x)
+        command = course.commands()
+        np.testing.assert_array_equal(course.teacher.other, command)
+        np.testing.assert_array_equal(course.teacher.dearer, 0.0)
 
 
 def test_a_family_without_a_style_is_walked_straight_on(course) -> None:

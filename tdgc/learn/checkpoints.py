@@ -28,7 +28,7 @@ from tdgc.errors import InputError
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
-_VERSION = 9  # since imitation learns from rollouts that it keeps
+_VERSION = 10  # since the teacher says a second way around pillars
 #: Names of what the recurrent learner remembers of the episodes under way.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 

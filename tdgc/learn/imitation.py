@@ -5,8 +5,10 @@ policy learns to say so from its own observations: DAgger (Ross et al. 2011), wi
 knows more than its student (Chen et al. 2019, "Learning by cheating"). Of a leap the teacher says
 what each step frequency with each stance length would cost, and the policy learns the cheapest
 (Ross and Bagnell 2014, AggreVaTe): with the teacher's choice itself as the only target it learned a
-mean of two ways over a trench, which leads into it. The critic learns what these episodes return,
-so that PPO goes on with a critic that knows the policy.
+mean of two ways over a trench, which leads into it. For the same reason the teacher says both ways
+around a pillar, and what counts is the error to the nearer one: the mean of both stands still in
+front of it. The critic learns what these episodes return, so that PPO goes on with a critic that
+knows the policy.
 """
 
 from collections import deque
@@ -21,14 +23,18 @@ from torch import nn
 
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, WholeEnvBuffer
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
-from tdgc.tasks.high_observation import GUIDANCE
+from tdgc.tasks.high_observation import GUIDANCE, GUIDANCE_PARTS
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
+from tdgc.tasks.teacher import WAY
 
 _STRIDE = [INDEX["frequency"], INDEX["stance_length"]]
 # As in the comparisons of docs/experiments.md: what a price weighs against a squared error in the
 # action, what is left of that error of a stride that has a price, and what a decision whose stride
 # has one weighs against others: an error in it leads into a trench, elsewhere most are forgiven.
 _PRICE_WEIGHT, _PRICED, _LEAP_WEIGHT = 10.0, 0.1, 4.0
+# What a metre more on the second way around weighs against a squared error: much less than taking
+# neither, which is 1 or more, as the ways are 1 m/s and more apart in ranges of 1.2 and 2.2 m/s.
+_DEARER = 1.0
 _NOTES = "notebook."  # what names in a checkpoint begin with
 
 
@@ -94,12 +100,14 @@ def expected_price(stride: th.Tensor, price: th.Tensor, limit: float) -> th.Tens
 
 def imitation_loss(mean: th.Tensor, guidance: th.Tensor, limit: float) -> th.Tensor:
     """How far actions (n, 13) are from what ``guidance`` (n, GUIDANCE) asks for, (n,)."""
-    taught, price = guidance[:, :NUM_ACTIONS], guidance[:, NUM_ACTIONS:]
+    taught, aside, dearer, price = th.split(guidance, list(GUIDANCE_PARTS.values()), dim=1)
     error = (mean - taught).square()
     weight, priced = th.ones_like(error), price.amax(1) > 0.0
     weight[:, _STRIDE] = th.where(priced, _PRICED, 1.0)[:, None]
+    other = (mean[:, WAY] - taught[:, WAY] - aside).square().sum(1) + _DEARER * dearer[:, 0]
+    saved = (error[:, WAY].sum(1) - other).clamp(min=0.0)  # by the second way around
     cost = expected_price(mean[:, _STRIDE], price.view(-1, FREQUENCIES, LENGTHS), limit)
-    loss = ((weight * error).sum(1) + _PRICE_WEIGHT * cost) / NUM_ACTIONS
+    loss = ((weight * error).sum(1) - saved + _PRICE_WEIGHT * cost) / NUM_ACTIONS
     return th.where(priced, _LEAP_WEIGHT, 1.0) * loss
 
 

@@ -33,7 +33,7 @@ from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, has_failed, outcome
 from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
-from tdgc.tasks.teacher import Teacher
+from tdgc.tasks.teacher import WAY, Teacher
 from tdgc.tasks.tiles import TrainingTiles, shallow
 
 
@@ -98,8 +98,7 @@ class NavigationTask:
         training: draw disturbances and let the curriculum move levels.
         visual: keep what pictures of the ground need.
         taught: a teacher's guidance follows the observation, see ``tdgc.learn.imitation``: its
-            actions, and the prices of step frequencies from the least to the greatest action, see
-            ``Teacher.price``.
+            actions, a second way around pillars, and the prices of strides.
         led: decisions of each robot over which the share of the episodes that the teacher drives
             falls from all to none.
         landing: of the low policy, for the teacher.
@@ -285,10 +284,17 @@ class NavigationTask:
         )
         if self.teacher is None:
             return seen
-        commands = self.teacher.commands(self.locomotion, self.goal)
-        self._taught = self.decoder.encode(self.decoder.nearest(commands))
-        parts = (seen, self._taught, self.teacher.price.reshape(self.num_robots, -1))
-        return np.concatenate(parts, axis=1, dtype=np.float32)
+        return np.concatenate([seen, self._guidance(self.teacher)], axis=1, dtype=np.float32)
+
+    def _guidance(self, teacher: Teacher) -> Array:
+        """What the teacher says, (M, ``GUIDANCE``), in the order of ``GUIDANCE_PARTS``."""
+        commands = teacher.commands(self.locomotion, self.goal)
+        self._taught, other = (
+            self.decoder.encode(self.decoder.nearest(way)) for way in (commands, teacher.other)
+        )
+        aside = (other - self._taught)[:, WAY]
+        price = teacher.price.reshape(self.num_robots, -1)
+        return np.column_stack([self._taught, aside, teacher.dearer, price])
 
     @property
     def reached(self) -> NDArray[np.bool_]:

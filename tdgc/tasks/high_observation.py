@@ -16,10 +16,18 @@ from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import FAMILIES
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP
+from tdgc.tasks.teacher import WAY
 
 GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
-#: Width of what a teacher adds to an observation.
-GUIDANCE = NUM_ACTIONS + FREQUENCIES * LENGTHS
+#: What a teacher adds to an observation, and how wide it is: its actions; how the second way around
+#: differs in those of ``WAY``, and its price; the prices of strides.
+GUIDANCE_PARTS = {
+    "taught": NUM_ACTIONS,
+    "aside": len(WAY),
+    "dearer": 1,
+    "price": FREQUENCIES * LENGTHS,
+}
+GUIDANCE = sum(GUIDANCE_PARTS.values())
 
 #: The semantic cue: one-hot over the families, and one place for "unknown".
 SEMANTIC = (*FAMILIES, "unknown")

@@ -97,6 +97,9 @@ _COARSE = 2
 _SEEN = 0.5  # share of the speed seen at a decision in the estimate: it swings within a gait cycle
 _WIDE = 0.55  # m from a pillar, where it ceases to cost
 _RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)
+_APART = 0.9  # rad between two ways around, whose mean would lead into what stands between them
+#: What the ways around a pillar differ in.
+WAY = [INDEX[name] for name in ("vx", "vy", "yaw_rate")]
 
 
 def toward(
@@ -160,6 +163,9 @@ class Teacher:
         speed: (M,) m/s ahead, as leaps should have it by now and as it was seen.
         price: (M, FREQUENCIES, LENGTHS) of the last ``commands``, what each step frequency with
             each stance length would have cost more than the best; 0 for robots that do not leap.
+        other: (M, 15) the last ``commands``, but by the second way around what is in the way; the
+            same commands where there is none.
+        dearer: (M,) m, how much longer the second way is, with a price on being near pillars.
     """
 
     def __init__(
@@ -186,6 +192,8 @@ class Teacher:
         self._command, self._uneven = commands[:-1], commands[-1]
         self.speed = np.zeros(m)
         self.price = np.zeros((m, FREQUENCIES, LENGTHS))
+        self.other = np.zeros((m, len(default_command())))
+        self.dearer = np.zeros(m)
         self._top_speed = np.array([style.speed for style in styles])
         self._uphill = np.array([style.uphill for style in styles])
         self._climb = np.zeros(m)  # m/s to the left of the tile's length
@@ -233,23 +241,17 @@ class Teacher:
         distance = np.linalg.norm(offset, axis=1)
         bearing = np.arctan2(offset[:, 1], offset[:, 0])
         local = state.position[:, :2] - self._origin
+        second = bearing.copy()
+        self.dearer[:] = 0.0
         for i, field in self._fields.items():
             if distance[i] > LOOK:
-                bearing[i] = _downhill(field, local[i], bearing[i])
-        error = wrap_angle(bearing - state.yaw)
+                bearing[i], second[i], self.dearer[i] = _ways(field, local[i], bearing[i])
         blind = local[:, 0] < self._start
         command = np.where(blind[:, None], self._uneven, self._command)
         top_speed = np.where(blind, UNEVEN.speed, self._top_speed)
-        speed, turn = toward(distance, error, top_speed, turns=self._ranges.yaw_rate)
-        # Around obstacles any way it faces: backward, too, off one that it leans on.
-        any_way = np.where(self._detours, np.minimum(top_speed, distance), 0.0)
-        speed = np.where(self._detours, any_way * np.cos(error), speed)
-        command[:, INDEX["vx"]] = speed + self._climb * np.sin(state.yaw)
-        command[:, INDEX["vy"]] = any_way * np.sin(error) + self._climb * np.cos(state.yaw)
-        command[:, INDEX["yaw_rate"]] = turn
-        for name in ("vx", "vy"):
-            column = command[:, INDEX[name]]
-            np.clip(column, *getattr(self._ranges, name), out=column)
+        self.other = command.copy()
+        for way, toward_bearing in ((command, bearing), (self.other, second)):
+            way[:, WAY] = self._walk(state.yaw, distance, toward_bearing, top_speed)
         self.price[:] = 0.0
         rows = np.flatnonzero(self._leaps & ~blind & (local[:, 0] < self._end))
         if rows.size and self._landing is not None:
@@ -262,16 +264,38 @@ class Teacher:
             lesson = self._plan.lesson(rows, motion, self._landing)
             leap_command(leaps, lesson.frequency, lesson.length)
             command[rows], self.price[rows] = leaps, lesson.price
+            self.other[rows] = leaps
         return command
 
+    def _walk(self, yaw: Array, distance: Array, bearing: Array, top_speed: Array) -> Array:
+        """Velocities ``WAY`` (M, 3) towards points at ``distance`` m and ``bearing`` rad."""
+        error = wrap_angle(bearing - yaw)
+        speed, turn = toward(distance, error, top_speed, turns=self._ranges.yaw_rate)
+        # Around obstacles any way it faces: backward, too, off one that it leans on.
+        any_way = np.where(self._detours, np.minimum(top_speed, distance), 0.0)
+        speed = np.where(self._detours, any_way * np.cos(error), speed)
+        vx = np.clip(speed + self._climb * np.sin(yaw), *self._ranges.vx)
+        vy = np.clip(any_way * np.sin(error) + self._climb * np.cos(yaw), *self._ranges.vy)
+        return np.column_stack([vx, vy, turn])
 
-def _downhill(field: tuple[Array, float, float], at: Array, ahead: float) -> float:
-    """Direction in rad from ``at`` (2,) m in which the travel cost falls most; near ties go to the
-    one closest to ``ahead``."""
+
+def _ways(field: tuple[Array, float, float], at: Array, ahead: float) -> tuple[float, float, float]:
+    """Directions in rad from ``at`` (2,) m in which the travel cost falls most and, apart from
+    there, second most, and what the second costs more, in m; twice the first if there is no other.
+
+    Near ties go to the direction closest to ``ahead``.
+    """
     cost, step, left = field
+
+    def to_go(x: Array | float, y: Array | float) -> Array:
+        cells = np.column_stack([x, y - left]) / step
+        return between(cost, np.clip(cells, 0.0, np.array(cost.shape) - 1.001))
+
     x, y = at[0] + LOOK * np.cos(_RAYS), at[1] + LOOK * np.sin(_RAYS)
-    cells = np.column_stack([x / step, (y - left) / step])
-    value = between(cost, np.clip(cells, 0.0, np.array(cost.shape) - 1.001))
-    value += 0.01 * np.abs(wrap_angle(_RAYS - ahead))
+    value = to_go(x, y) + 0.01 * np.abs(wrap_angle(_RAYS - ahead))
     value[(x < 0.0) | (x > TILE_SIZE)] = np.inf
-    return float(_RAYS[value.argmin()])
+    first = value.argmin()
+    least = (value <= np.roll(value, 1)) & (value <= np.roll(value, -1)) & (value < to_go(*at))
+    apart = np.abs(wrap_angle(_RAYS - _RAYS[first])) > _APART
+    second = min(np.flatnonzero(least & apart), key=value.item, default=first)
+    return float(_RAYS[first]), float(_RAYS[second]), float(value[second] - value[first])
