@@ -340,7 +340,8 @@ GUI_CONDITION = "--gui shows the nominal condition: no --conditions"
         (["--policies", "wtw"], "unknown policy 'wtw'; allowed: all, tdgc, gp, cues, teacher"),
         (
             ["--policies", "gp,teacher", "--conditions", "nominal,mixed"],
-            "the teacher knows rough, pillar, stair, gap, tilt, clutter; it cannot lead on mixed",
+            "the teacher knows rough, pillar, stair, gap, tilt, clutter, ditches; "
+            "it cannot lead on mixed",
         ),
         (["--families", "gap,gap"], "family 'gap' is named twice"),
         (["--levels", "6-8,7"], "--levels '6-8,7' names a level twice"),

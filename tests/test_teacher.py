@@ -67,7 +67,7 @@ def course():
 
 
 def test_each_family_is_walked_in_its_style(course) -> None:
-    families = [family for family in STYLES if family not in ("pillar", "clutter")]
+    families = [family for family in STYLES if family not in ("pillar", "clutter", "ditches")]
     course = course(families)
     course.put(1.0)
     commands = course.commands()
@@ -167,6 +167,24 @@ def test_a_family_without_a_style_is_walked_straight_on(course) -> None:
     command = course.commands()[0]
     assert command[INDEX["vx"]] == pytest.approx(UNEVEN.speed) and gait_index(command) == 0
     assert command[INDEX["swing_height"]] == UNEVEN.swing_height
+
+
+def test_leaps_over_trenches_between_other_ground(course) -> None:
+    """Walking until the trench comes in sight, and again once it is behind."""
+    course = course(["ditches", "gap"])
+    trench = np.array([[4.0, 4.25]])
+    course.field.features[0, 0] = Features(trenches=trench, pillars=np.array([[2.0, 4.6, 0.3]]))
+    course.field.features[1, 0] = Features(trenches=trench)
+    course.teacher.begin(np.arange(2), course.goal)
+    for x, gait in ((4.0 - SIGHT - 0.05, 0), (4.0 - SIGHT + 0.05, 1), (4.7, 1), (4.8, 0)):
+        course.put(x)
+        command, on_gap = course.commands()
+        assert gait_index(command) == gait
+        if gait:
+            np.testing.assert_array_equal(command, on_gap)
+        else:
+            assert command[INDEX["swing_height"]] == UNEVEN.swing_height
+            assert command[INDEX["vx"]] == pytest.approx(UNEVEN.speed, abs=0.02)
 
 
 def test_a_policy_that_does_not_leap_walks_over_trenches(course) -> None:

@@ -158,7 +158,7 @@ def test_bad_difficulty_names_the_range(difficulty):
 
 
 def test_bad_family_names_the_families():
-    with pytest.raises(ValueError, match=r"'stairs'; choose from rough, .*, clutter, FILE\.npy$"):
+    with pytest.raises(ValueError, match=r"'stairs'; choose from rough, .*, ditches, FILE\.npy$"):
         tile("stairs", 0.5)
     with pytest.raises(
         ValueError, match=r"'mixed' has no parameter; choose from rough, .*, clutter$"
@@ -256,6 +256,29 @@ def test_ways_through_clutter_are_as_wide_as_between_pillars():
         for _ in range(12):
             joined = (joined.astype(int) @ joined) > 0
         assert away[~joined].min(initial=np.inf) >= 0.6 - 1e-9
+
+
+def test_ditches_are_trenches_before_or_behind_clutter():
+    orders, obstacles, starts = [], 0, []
+    for seed in range(40):
+        made = tile("ditches", 1, seed)
+        lips, x = made.features.trenches, made.features.pillars[:, 0]
+        middle = lips.mean(axis=1)
+        assert 1 <= len(lips) <= 4 and (np.diff(middle) >= 0.75 - 0.05).all()
+        for lip in lips:  # through, all across
+            inside = made.heights[round(lip.mean() / 0.05)]
+            assert (inside == np.float32(-0.6)).all()
+        behind = made.parts == ("clutter", "gap")
+        assert behind or made.parts == ("gap", "clutter")
+        if behind:
+            assert (x < lips[0, 0]).all() and lips[-1, 1] <= 6.5 - 0.3 + 0.25
+        else:
+            assert (x > lips[-1, 1]).all() and lips[0, 0] >= 1.5 + 0.3 - 0.25
+        orders.append(behind)
+        obstacles += len(x)
+        starts.append(lips[0, 0])
+    assert 10 <= sum(orders) <= 30 and obstacles > 40
+    assert min(starts) < 2.0 and max(starts) > 4.0
 
 
 @pytest.mark.parametrize(("difficulty", "step"), [(0, 0.03), (0.5, 0.09), (1, 0.15), (1.2, 0.174)])

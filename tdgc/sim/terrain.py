@@ -32,9 +32,10 @@ EDITION = 2
 
 # Families and levels: Sec. III-A; Mixed and the levels past 10 are only ever evaluated on.
 FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
-#: A family for training that is not of the benchmark: ground of many kinds that has no name.
-CLUTTER = "clutter"
-ALL_FAMILIES = (*FAMILIES, "mixed", CLUTTER)
+#: Families for training that are not of the benchmark: ground of many kinds that has no name, and
+#: the same with trenches before or behind it.
+CLUTTER, DITCHES = "clutter", "ditches"
+ALL_FAMILIES = (*FAMILIES, "mixed", CLUTTER, DITCHES)
 #: A family whose name ends so is a file with heights of the user's own, see ``height_map``.
 MAP_ENDING = ".npy"
 MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1
@@ -90,6 +91,9 @@ WALL_LENGTH = (0.4, 1.2)  # m
 WALLS = (2, 6)
 WALL_THICKNESS = 0.2  # m
 
+# Ditches, ours as well: at its least either part has room for two trenches or four steps.
+SHORTEST_PART = 1.5  # m
+
 # Bullet keeps the height range of a field's first upload, so it is pinned to what any tile can
 # need: Tilt at level 12 reaches W/2 tan(0.54 rad) = 2.40 m either way, everything else less.
 HEIGHT_RANGE = (-2.5, 2.5)  # m
@@ -119,13 +123,16 @@ class Section(NamedTuple):
     high: float
 
 
-_MIDDLE = sum(ZONE) / 2
 WHOLE_ZONE = Section(START_END, *ZONE, GOAL_BEGIN)
-# Mixed: half a zone each, both level with the platforms where they meet.
-HALF_ZONES = (
-    Section(START_END, ZONE[0], _MIDDLE, _MIDDLE),
-    Section(_MIDDLE, _MIDDLE, ZONE[1], GOAL_BEGIN),
-)
+
+
+def halves(meet: float) -> tuple[Section, Section]:
+    """The zone in two, both level with the platforms where they ``meet``, at that x in m."""
+    begin, end = ZONE
+    return Section(START_END, begin, meet, meet), Section(meet, meet, end, GOAL_BEGIN)
+
+
+HALF_ZONES = halves(sum(ZONE) / 2)  # of Mixed
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +208,7 @@ class Tile:
 def difficulty_parameter(family: str, difficulty: float) -> float:
     """Geometric parameter p(d) = p_min + d (p_max - p_min) of a family (Eq. 1).
 
-    Mixed has none of its own: each of its halves uses its family's.
+    Mixed and Ditches have none of their own: each of their parts uses its family's.
 
     Raises:
         ValueError: a family without a parameter, or a difficulty outside [0, 1.2].
@@ -247,6 +254,10 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
     if family == "mixed":
         first, second = rng.choice(len(FAMILIES), size=2, replace=False)
         parts, sections = (FAMILIES[first], FAMILIES[second]), HALF_ZONES
+    elif family == DITCHES:
+        parts = (CLUTTER, "gap") if rng.uniform() < 0.5 else ("gap", CLUTTER)
+        begin, end = ZONE
+        sections = halves(rng.uniform(begin + SHORTEST_PART, end - SHORTEST_PART))
 
     heights = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
     support = np.zeros((TILE_SAMPLES, TILE_SAMPLES))
@@ -386,7 +397,8 @@ def clutter(section: Section, step: float, rng: np.random.Generator) -> Relief:
     """Flat ground, hills or paving, with slabs to step on and posts, pits or walls to walk around.
 
     No step is higher than ``step``, but for those of hills, whose slope adds to it. The kinds of
-    ground and of obstacles are drawn for each tile, so no two are much alike.
+    ground and of obstacles are drawn for each tile, so no two are much alike. A section gets its
+    share of what a whole zone has of slabs and obstacles.
     """
     kind = rng.choice(["flat", "hills", "paving"])
     if kind == "paving":
@@ -400,10 +412,10 @@ def clutter(section: Section, step: float, rng: np.random.Generator) -> Relief:
     obstacles = str(rng.choice(["none", "posts", "pits", "walls"]))
     circles = np.empty((0, 3))
     if obstacles == "walls":
-        count = int(rng.integers(WALLS[0], WALLS[1] + 1))
+        count = round(_share(section) * rng.integers(WALLS[0], WALLS[1] + 1))
         circles = _walls(place(section, count, WALL_LENGTH, rng), rng)
     elif obstacles != "none":
-        count = int(rng.integers(OBSTACLES[0], OBSTACLES[1] + 1))
+        count = round(_share(section) * rng.integers(OBSTACLES[0], OBSTACLES[1] + 1))
         circles = place(section, count, OBSTACLE_DIAMETER, rng)
     level = -TRENCH_DEPTH if obstacles == "pits" else PILLAR_HEIGHT
     heights = np.where(_within(circles), level, ground)
@@ -435,7 +447,7 @@ def _with_slabs(
 ) -> FloatArray:
     """Ground with slabs and bars on it, each up to ``step`` thick; none lies on another."""
     heights = ground.copy()
-    for _ in range(rng.integers(SLABS + 1)):
+    for _ in range(round(_share(section) * rng.integers(SLABS + 1))):
         centre = rng.uniform([section.begin, 0.0], [section.end, TILE_SIZE])
         turn, half = rng.uniform(*_TURN), 0.5 * rng.uniform(*SLAB_SIDE, 2)
         u, v = _turned(_PLANE - centre[:, None, None], turn)

@@ -18,7 +18,7 @@ from tdgc.config import CommandRanges
 from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
-from tdgc.sim.terrain import CELL, CLUTTER, TILE_SAMPLES, TILE_SIZE, TileField
+from tdgc.sim.terrain import CELL, CLUTTER, DITCHES, TILE_SAMPLES, TILE_SIZE, TileField
 from tdgc.tasks.leaps import (
     BEYOND,
     FREQUENCIES,
@@ -87,6 +87,7 @@ STYLES = {
     "gap": Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1),
     "tilt": Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45),
     CLUTTER: UNEVEN,
+    DITCHES: UNEVEN,
 }
 
 #: m ahead that the probes see a trench; they reach 1.05 m.
@@ -178,18 +179,18 @@ class Teacher:
         m = len(families)
         self._field, self._ranges, self._landing = field, ranges, landing
         self._origin = field.origin(np.arange(m), 0)
-        self._leaps = np.array([family == "gap" and landing is not None for family in families])
-        self._detours = np.array([family in ("pillar", CLUTTER) for family in families])
+        self._gap = np.array([family == "gap" for family in families])
+        self._detours = np.array([family in ("pillar", CLUTTER, DITCHES) for family in families])
         styles = [
             UNEVEN if family == "gap" and landing is None else STYLES.get(family, UNEVEN)
             for family in families
         ]
-        commands = np.array([style.command() for style in [*styles, UNEVEN]])
+        commands = np.array([style.command() for style in [*styles, UNEVEN, STYLES["gap"]]])
         # A low policy may have been trained on less than the styles ask for.
         bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
         behaviour = commands[:, : len(CONTINUOUS)]
         np.clip(behaviour, bounds[:, 0], bounds[:, 1], out=behaviour)
-        self._command, self._uneven = commands[:-1], commands[-1]
+        self._command, self._uneven, self._leap = commands[:-2], commands[-2], commands[-1]
         self.speed = np.zeros(m)
         self.price = np.zeros((m, FREQUENCIES, LENGTHS))
         self.other = np.zeros((m, len(default_command())))
@@ -197,6 +198,7 @@ class Teacher:
         self._top_speed = np.array([style.speed for style in styles])
         self._uphill = np.array([style.uphill for style in styles])
         self._climb = np.zeros(m)  # m/s to the left of the tile's length
+        self._leaps = np.zeros(m, dtype=bool)
         self._plan = LeapPlan(m, ranges)
         self._leap_speed = min(SPEED, ranges.vx[1])
         self._start = np.full(m, -np.inf)  # m, x where a robot begins to leap
@@ -218,13 +220,15 @@ class Teacher:
         self.speed[index] = 0.0
         slopes = [self._field.features[int(i), 0].slope for i in index]
         self._climb[index] = self._uphill[index] * np.sin(slopes)
-        for i in index[self._leaps[index]]:
+        for i in index:
             trenches = self._field.features[int(i), 0].trenches
-            assert self._landing is not None  # or nobody leaps
-            self._plan.look(int(i), trenches, self._landing.spread)
-            blind = untold is not None and untold[i]
-            self._start[i] = trenches[0, 0] - SIGHT if blind else -np.inf
-            self._end[i] = trenches[-1, 1] + BEYOND
+            self._leaps[i] = self._landing is not None and len(trenches)
+            if self._leaps[i]:
+                assert self._landing is not None
+                self._plan.look(int(i), trenches, self._landing.spread)
+                blind = not self._gap[i] or (untold is not None and untold[i])
+                self._start[i] = trenches[0, 0] - SIGHT if blind else -np.inf
+                self._end[i] = trenches[-1, 1] + BEYOND
         for i in index[self._detours[index]]:
             pillars, target = self._field.features[int(i), 0].pillars, goal[i] - self._origin[i]
             self._fields[int(i)] = travel_cost(pillars, width, self._field.crop, target)
@@ -255,7 +259,7 @@ class Teacher:
         self.price[:] = 0.0
         rows = np.flatnonzero(self._leaps & ~blind & (local[:, 0] < self._end))
         if rows.size and self._landing is not None:
-            leaps = command[rows]
+            leaps = np.tile(self._leap, (len(rows), 1))
             steer_leap(leaps, bearing[rows], state.yaw[rows], self._ranges)
             commanded = np.full(len(rows), self._leap_speed)
             stride = loco.command[rows][:, [INDEX["frequency"], INDEX["stance_length"]]].T
@@ -264,7 +268,7 @@ class Teacher:
             lesson = self._plan.lesson(rows, motion, self._landing)
             leap_command(leaps, lesson.frequency, lesson.length)
             command[rows], self.price[rows] = leaps, lesson.price
-            self.other[rows] = leaps
+            self.other[rows], self.dearer[rows] = leaps, 0.0
         return command
 
     def _walk(self, yaw: Array, distance: Array, bearing: Array, top_speed: Array) -> Array:
