@@ -277,6 +277,18 @@ def test_time_that_is_over_stops_before_a_trial(
     assert not (tmp_path / "full-42").exists()
 
 
+@pytest.mark.parametrize(
+    ("trained", "evaluated"),
+    [("gap,clutter,gap,ditches", "gap"), ("ditches,clutter", "ditches,clutter")],
+)
+def test_ground_without_a_name_is_not_evaluated_on(trained: str, evaluated: str) -> None:
+    """Unless there is no other to evaluate on."""
+    settings = (f"env.families={json.dumps(trained.split(','))}",)
+    runner = Runner(Path(), PRETRAINED / "low", False, settings, None, "6", 1, 1, None)
+    flags = runner.evaluation_flags("gp", runner.low, None)
+    assert flags[flags.index("--families") + 1] == evaluated
+
+
 def test_a_table_that_cannot_be_written_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,7 +29,7 @@ from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
 from tdgc.files import atomic
 from tdgc.parallel.cores import Workers
-from tdgc.sim.terrain import CLUTTER
+from tdgc.sim.terrain import UNNAMED
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import OUTCOMES
 
@@ -165,10 +165,10 @@ class Runner:
     def evaluation_flags(self, policy: str, low: Path, high: Path | None) -> list[object]:
         """The flags of evaluate.py: of all variants the same tiles."""
         env = with_overrides(HighTrainConfig(), self.settings).env
-        families = dict.fromkeys(name for name in env.families if name != CLUTTER)
+        families = dict.fromkeys(name for name in env.families if name not in UNNAMED)
         flags: list[object] = [
             *("--policies", policy, "--levels", self.levels, "--episodes", self.episodes),
-            *("--families", ",".join(families or (CLUTTER,))),
+            *("--families", ",".join(families or dict.fromkeys(env.families))),
             *("--low", low, "--workers", self.workers),
         ]
         return flags if high is None else [*flags, "--high", high]

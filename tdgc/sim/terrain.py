@@ -34,8 +34,8 @@ EDITION = 2
 FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
 #: Families for training that are not of the benchmark: ground of many kinds that has no name, and
 #: the same with trenches before or behind it.
-CLUTTER, DITCHES = "clutter", "ditches"
-ALL_FAMILIES = (*FAMILIES, "mixed", CLUTTER, DITCHES)
+UNNAMED = CLUTTER, DITCHES = "clutter", "ditches"
+ALL_FAMILIES = (*FAMILIES, "mixed", *UNNAMED)
 #: A family whose name ends so is a file with heights of the user's own, see ``height_map``.
 MAP_ENDING = ".npy"
 MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1
@@ -130,9 +130,6 @@ def halves(meet: float) -> tuple[Section, Section]:
     """The zone in two, both level with the platforms where they ``meet``, at that x in m."""
     begin, end = ZONE
     return Section(START_END, begin, meet, meet), Section(meet, meet, end, GOAL_BEGIN)
-
-
-HALF_ZONES = halves(sum(ZONE) / 2)  # of Mixed
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +250,7 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
     sections: tuple[Section, ...] = (WHOLE_ZONE,)
     if family == "mixed":
         first, second = rng.choice(len(FAMILIES), size=2, replace=False)
-        parts, sections = (FAMILIES[first], FAMILIES[second]), HALF_ZONES
+        parts, sections = (FAMILIES[first], FAMILIES[second]), halves(sum(ZONE) / 2)
     elif family == DITCHES:
         parts = (CLUTTER, "gap") if rng.uniform() < 0.5 else ("gap", CLUTTER)
         begin, end = ZONE

@@ -18,7 +18,7 @@ from tdgc.config import CommandRanges
 from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
-from tdgc.sim.terrain import CELL, CLUTTER, DITCHES, TILE_SAMPLES, TILE_SIZE, TileField
+from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, UNNAMED, TileField
 from tdgc.tasks.leaps import (
     BEYOND,
     FREQUENCIES,
@@ -86,8 +86,7 @@ STYLES = {
     # in pronk, see ``tdgc.tasks.leaps``
     "gap": Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1),
     "tilt": Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45),
-    CLUTTER: UNEVEN,
-    DITCHES: UNEVEN,
+    **dict.fromkeys(UNNAMED, UNEVEN),
 }
 
 #: m ahead that the probes see a trench; they reach 1.05 m.
@@ -180,7 +179,7 @@ class Teacher:
         self._field, self._ranges, self._landing = field, ranges, landing
         self._origin = field.origin(np.arange(m), 0)
         self._gap = np.array([family == "gap" for family in families])
-        self._detours = np.array([family in ("pillar", CLUTTER, DITCHES) for family in families])
+        self._detours = np.array([family in ("pillar", *UNNAMED) for family in families])
         styles = [
             UNEVEN if family == "gap" and landing is None else STYLES.get(family, UNEVEN)
             for family in families
@@ -198,7 +197,6 @@ class Teacher:
         self._top_speed = np.array([style.speed for style in styles])
         self._uphill = np.array([style.uphill for style in styles])
         self._climb = np.zeros(m)  # m/s to the left of the tile's length
-        self._leaps = np.zeros(m, dtype=bool)
         self._plan = LeapPlan(m, ranges)
         self._leap_speed = min(SPEED, ranges.vx[1])
         self._start = np.full(m, -np.inf)  # m, x where a robot begins to leap
@@ -213,18 +211,17 @@ class Teacher:
         Args:
             index: of the robots.
             goal: (M, 2) m in the world.
-            untold: (M,) whose high policy is not told its family; nobody's if None. Such a robot
-                sees flat ground at first, like any other, and leaps when it sees a trench.
+            untold: (M,) whose high policy is not told its family; nobody's if None. Such a robot,
+                and one of a family other than Gap, leaps when it sees a trench.
         """
         width = self._field.heights.shape[1]
         self.speed[index] = 0.0
         slopes = [self._field.features[int(i), 0].slope for i in index]
         self._climb[index] = self._uphill[index] * np.sin(slopes)
+        self._start[index] = self._end[index] = -np.inf
         for i in index:
             trenches = self._field.features[int(i), 0].trenches
-            self._leaps[i] = self._landing is not None and len(trenches)
-            if self._leaps[i]:
-                assert self._landing is not None
+            if self._landing is not None and len(trenches):
                 self._plan.look(int(i), trenches, self._landing.spread)
                 blind = not self._gap[i] or (untold is not None and untold[i])
                 self._start[i] = trenches[0, 0] - SIGHT if blind else -np.inf
@@ -257,7 +254,7 @@ class Teacher:
         for way, toward_bearing in ((command, bearing), (self.other, second)):
             way[:, WAY] = self._walk(state.yaw, distance, toward_bearing, top_speed)
         self.price[:] = 0.0
-        rows = np.flatnonzero(self._leaps & ~blind & (local[:, 0] < self._end))
+        rows = np.flatnonzero(~blind & (local[:, 0] < self._end))
         if rows.size and self._landing is not None:
             leaps = np.tile(self._leap, (len(rows), 1))
             steer_leap(leaps, bearing[rows], state.yaw[rows], self._ranges)
