@@ -20,7 +20,7 @@ from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES
 
 LOW, CONFIG = load_low(PRETRAINED / "low")
-POINTS = PROBES["lines"]
+POINTS = PROBES[HighLevelConfig().probes]
 
 
 # ------------------------------------------------------------------ what it remembers

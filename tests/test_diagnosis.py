@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tdgc.benchmark import diagnosis, drivers
+from tdgc.benchmark import diagnosis, planted
 from tdgc.benchmark.diagnosis import (
     LIMITS,
     REACH,
@@ -20,12 +20,10 @@ from tdgc.benchmark.diagnosis import (
     features,
     place_of,
 )
-from tdgc.benchmark.drivers import HierarchyDriver, load_high
+from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Cell, Episode, run_cell, tile_of
+from tdgc.benchmark.planted import Blindfold, SwappedBounds, WeakMotor, measured_limits
 from tdgc.benchmark.trace import COLUMNS, Trace, Tracer
-from tdgc.sim.commands import INDEX
-from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import NUM_PROBES
 
@@ -44,72 +42,69 @@ def pair(low):
 
 # ------------------------------------------------------------------ planted faults
 
-SEED = 11  # none of those that the limits were measured on
-
 
 def blamed(driver: HierarchyDriver, low: Any, cells: list[tuple[str, int, int]]) -> list[str]:
     """The layers that are blamed for the failures of (family, level, episodes)."""
-    layers = []
-    for family, level, count in cells:
-        tracer = Tracer(driver, SEED)
-        run_cell(Cell("tdgc", "nominal", family, level, 0, count), low, driver, SEED, [tracer])
-        failures = [t for t in tracer.traces() if t.outcome != "reached"]
-        layers += [diagnose(t, HIPS).layer for t in failures]
-    return layers
+    return [
+        layer
+        for family, level, count in cells
+        for layer in planted.blamed(driver, low, family, level, count, HIPS)
+    ]
 
 
-class WeakMotor(HierarchyDriver):
-    """One motor of every robot has lost its strength."""
-
-    joint = 0
-
-    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
-        super().begin(loco, goal, *told)
-        loco.world.strength = np.ones((loco.num_robots, 12))
-        loco.world.strength[:, self.joint] = 0.02
-
-
-class Blindfold(HierarchyDriver):
-    """The high policy sees flat ground of an unknown family and a goal where there is none."""
-
-    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
-        angle = np.random.default_rng(0).uniform(-np.pi, np.pi, loco.num_robots)
-        here = loco.world.state.position[:, :2]
-        c, s = np.cos(angle), np.sin(angle)
-        x, y = (goal - here).T
-        turned = here + np.stack([c * x - s * y, s * x + c * y], axis=1)
-        super().begin(loco, turned, "mixed")
-
-    def command(self, step: int) -> Array:
-        def blind(layout: Any, seen: Any) -> Any:
-            return observe(layout, seen._replace(probes=0.0 * seen.probes))
-
-        observe = drivers.observe
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(drivers, "observe", blind)
-            return super().command(step)
-
-
-@pytest.mark.parametrize("joint", [2, 11])  # a front calf, a rear calf
+@pytest.mark.parametrize("joint", ["FL_calf_joint", "RR_calf_joint"])
 def test_a_broken_motor_is_the_executions_fault(joint, low, pair):
-    driver = WeakMotor(*pair)
-    driver.joint = joint
-    layers = blamed(driver, low[0], [("rough", 4, 4), ("pillar", 4, 2)])
+    layers = blamed(WeakMotor(*pair, joint), low[0], [("rough", 4, 4), ("pillar", 4, 2)])
     assert len(layers) >= 3 and layers.count("execution") >= 0.8 * len(layers)
 
 
 @pytest.mark.parametrize("command", ["vx", "yaw_rate"])
 def test_swapped_bounds_of_a_decoder_are_the_decisions_fault(command, low, pair):
-    driver = HierarchyDriver(*pair)
-    decoder, j = driver._decoder, INDEX[command]
-    decoder.low[j], decoder.high[j] = decoder.high[j], decoder.low[j]
-    layers = blamed(driver, low[0], [("rough", 4, 3), ("pillar", 4, 3)])
+    layers = blamed(SwappedBounds(*pair, command), low[0], [("rough", 4, 3), ("pillar", 4, 3)])
     assert len(layers) >= 3 and layers.count("decisions") >= 0.8 * len(layers)
 
 
 def test_a_blindfold_is_the_decisions_fault(low, pair):
     layers = blamed(Blindfold(*pair), low[0], [("rough", 4, 4), ("pillar", 6, 4)])
     assert len(layers) >= 3 and layers.count("decisions") >= 0.8 * len(layers)
+
+
+def test_limits_are_measured_where_nothing_is_wrong():
+    """Of 20 episodes one has 0.5 m/s of error in one of its three stretches, all others 0.1."""
+    traces = [walk(outcome="reached", seconds=7.0, error_vx=0.1) for _ in range(20)]
+    traces[-1]["error_vx"][-20:] = 0.5
+    velocity, turn = (measured_limits(traces, HIPS)[name] for name in ("velocity", "yaw rate"))
+    assert turn == (0.0, 0.0)
+    assert velocity[0] == pytest.approx(0.1)  # a stretch of 60 is rarer than one of 20
+    errors = [*[0.1] * 19, 0.1 + 0.4 * 20 / 60]
+    assert velocity[1] == pytest.approx(np.percentile(errors, 95), abs=1e-6)
+
+
+def test_the_table_of_planted_faults(monkeypatch, capsys):
+    small = {
+        "FAULTS": [f for f in planted.FAULTS if f.name.startswith("a front calf's")],
+        "FAMILIES": ("rough",),
+        "EPISODES": 4,
+        "LIMIT_SEEDS": (1,),
+        "LIMIT_LEVELS": (0,),
+        "LIMIT_EPISODES": 1,
+    }
+    for name, value in small.items():
+        monkeypatch.setattr(planted, name, value)
+    assert planted.main([]) == 0
+    head, fault, total, _, walked, _, velocity, *_ = capsys.readouterr().out.splitlines()
+    assert head.split() == ["fault", "layer", "rough"]
+    assert fault.startswith("a front calf's motor at 2 % strength") and fault.endswith("4 of 4")
+    assert total == "4 of 4 failures blamed on the layer at fault"
+    assert walked == "without a fault, 95 % of 2 episodes that reached their goals"
+    name, stretch, _, limit, episode, *_ = velocity.split()
+    assert name == "velocity" and 0.0 < float(episode) < float(stretch) < 2.0 * float(limit)
+
+
+def test_planting_refuses_a_pair_that_is_not_there(tmp_path, capsys):
+    assert planted.main(["--high", str(tmp_path / "none")]) == 2
+    out, err = capsys.readouterr()
+    assert not out and err.count("\n") == 1 and str(tmp_path / "none") in err
 
 
 # ------------------------------------------------------------------ the rules, one by one
@@ -220,9 +215,9 @@ def test_who_walks_blindly_into_a_trench_made_no_decision():
 
 
 def test_the_baseline_is_not_blamed_on_the_low_level_in_gap(low):
-    driver = drivers.BaselineDriver()
-    tracer = Tracer(driver, SEED)
-    run_cell(Cell("gp", "nominal", "gap", 8, 0, 3), low[0], driver, SEED, [tracer])
+    driver = BaselineDriver()
+    tracer = Tracer(driver, planted.SEED)
+    run_cell(Cell("gp", "nominal", "gap", 8, 0, 3), low[0], driver, planted.SEED, [tracer])
     failures = [diagnose(t, HIPS) for t in tracer.traces() if t.outcome != "reached"]
     assert len(failures) >= 2
     assert {f.cause for f in failures} == {"walked blindly into a trench"}

@@ -234,7 +234,7 @@ def test_mixed_terrain_is_unknown_to_the_high_level(low, tmp_path):
 
         def expected(index: int) -> Array:
             zero, families = np.zeros((1, NUM_ACTIONS)), np.array([index])
-            probes = height_probes(loco, PROBES["lines"])
+            probes = height_probes(loco, PROBES[HighLevelConfig().probes])
             nothing = np.zeros(1)
             seen = Seen(loco, goal, nothing, zero, families, probes, nothing, nothing)
             action, _ = high.predict(observe(high_layout(config), seen))

@@ -43,7 +43,7 @@ from tdgc.tasks.rewards import HighStep
 from tdgc.tasks.teacher import WAY
 
 LOW = PRETRAINED / "low"
-POINTS = PROBES["lines"]
+POINTS = PROBES[HighLevelConfig().probes]
 NOMINAL = nominal_pose(RobotConfig())
 CONFIG = HighLevelConfig(commands=load_low(LOW)[1].commands)
 

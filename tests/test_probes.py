@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tdgc.config import PhysicsConfig, RandomisationConfig, RobotConfig
+from tdgc.config import HighLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TileField, make_tile
@@ -38,7 +38,7 @@ def loco() -> Iterator[Locomotion]:
     loco.world.close()
 
 
-POINTS = PROBES["lines"]
+POINTS = PROBES[HighLevelConfig().probes]
 
 
 def test_they_are_the_same_on_both_sides_and_close_enough() -> None:

@@ -21,6 +21,7 @@ import train_high
 import train_low
 from tdgc import bench, calibration, diagnose, export, mujoco
 from tdgc.ablate import __main__ as ablate
+from tdgc.benchmark import planted
 from tdgc.benchmark.evaluation import CONDITIONS
 from tdgc.config import (
     HighLevelConfig,
@@ -47,6 +48,7 @@ MAINS = {
     "tdgc.calibration": calibration.main,
     "tdgc.export": export.main,
     "tdgc.diagnose": diagnose.main,
+    "tdgc.benchmark.planted": planted.main,
     "tdgc.mujoco": mujoco.main,
     "tdgc.ablate": ablate.main,
 }
@@ -173,6 +175,7 @@ READ = (
     "OMP_NUM_THREADS=1 python train_low.py --workers 1",
     "python -m tdgc.ablate --out runs/ablation",
     "python -m tdgc.diagnose run.npz --export runs/export --outcome fell",
+    "python -m tdgc.benchmark.planted",
     "python -m tdgc.export --out runs/export",
     "python -m tdgc.mujoco --export runs/export --levels 6-10 --families all --episodes 20",
     "python train_high.py --no-teacher --low runs/low/policy --out runs/alone",

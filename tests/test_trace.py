@@ -20,7 +20,7 @@ from tdgc.benchmark import evaluation, trace
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Cell, Episode, run_cell
 from tdgc.benchmark.trace import COLUMNS, Selection, Trace, TraceError, Tracer
-from tdgc.config import HighRewardConfig
+from tdgc.config import HighLevelConfig, HighRewardConfig
 from tdgc.sim.commands import CONTINUOUS, INDEX, NAMES, CommandDecoder
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.locomotion import Locomotion
@@ -39,7 +39,7 @@ class Notes(Tracer):
     def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
         super().begin(cell, loco, field, goal)
         self.goal, self.seen = goal, [self._note(loco)]
-        self.probes = height_probes(loco, PROBES["lines"])
+        self.probes = height_probes(loco, PROBES[HighLevelConfig().probes])
 
     def step(self, step: int, live: Any, outcome: Any) -> None:
         super().step(step, live, outcome)
@@ -56,7 +56,7 @@ class Notes(Tracer):
             "turn": s.ang_vel[:, 2].copy(),
             "touch": s.foot_force > 1.0,
             "wanted": loco.clock.contact > 0.5,
-            "probes": height_probes(loco, PROBES["lines"]),
+            "probes": height_probes(loco, PROBES[HighLevelConfig().probes]),
             "power": np.abs(s.torque * s.qd).sum(axis=1),
             "force": np.column_stack([s.trunk_force, s.leg_force]),
             "command": loco.command.copy(),
@@ -155,6 +155,19 @@ def test_cues_are_what_the_high_level_was_told(watched):
         assert set(t["family"]) == {"rough"}
         assert [t[f"probe_{i:02d}"][0] for i in range(32)] == pytest.approx(notes.probes[k])
         assert np.isnan(t["probe_00"][-1])  # the end has no decision
+
+
+@pytest.mark.parametrize("probes", ["graded", "lines", "staggered"])
+def test_it_says_where_the_probes_are(low, tmp_path, probes: str):
+    config = dataclasses.replace(CONFIG, probes=probes)
+    driver = HierarchyDriver(*load_high(save_high(tmp_path / "high", low, config), *low))
+    _, (t,), _ = watch(driver, Cell("tdgc", "nominal", "stair", 8, 3, 1), low[0])
+    trace.write(t, tmp_path)
+    found = trace.read(tmp_path / t.file_name).probes
+    places = np.array([place.split(",") for place in found.split(" ")], dtype=float)
+    np.testing.assert_allclose(places, PROBES[probes], atol=1e-9)
+    _, (blind,), _ = watch(BaselineDriver(), Cell("gp", "nominal", "stair", 8, 3, 1), low[0])
+    assert blind.probes == ""
 
 
 def test_cues_are_those_of_the_condition(low, watched_high):
@@ -296,7 +309,7 @@ def test_a_file_holds_the_trace_and_says_what_it_is(watched, tmp_path):
         assert (about["unit"], about["description"]) == (c.unit, c.meaning)
         assert schema.field(c.name).type in (pa.float32(), pa.string())  # scalars only
     meta = {k.decode(): v.decode() for k, v in schema.metadata.items()}
-    assert meta["format"] == "tdgc-trace" and meta["version"] == "2"
+    assert meta["format"] == "tdgc-trace" and meta["version"] == "3"
     assert (meta["outcome"], meta["seed"], meta["episode"]) == (t.outcome, "5", "3")
     assert pq.read_table(path)["command_vx"].null_count == 1  # the end has no decision
 
@@ -316,7 +329,7 @@ def test_files_that_are_no_traces_are_refused(watched, tmp_path):
     table = pq.read_table(path)
     meta = table.schema.metadata
     pq.write_table(table.replace_schema_metadata(meta | {b"version": b"1"}), other)
-    with pytest.raises(TraceError, match=r"a trace of version 1, this package reads 2$"):
+    with pytest.raises(TraceError, match=r"a trace of version 1, this package reads 3$"):
         trace.read(other)
     moved = table.schema.field("probe_00").with_metadata({"unit": "m", "description": "elsewhere"})
     place = table.schema.get_field_index("probe_00")
@@ -326,7 +339,7 @@ def test_files_that_are_no_traces_are_refused(watched, tmp_path):
         table.cast(table.schema.set(place, moved)),
     ):
         pq.write_table(wrong, other)
-        with pytest.raises(TraceError, match=r"columns are not those of a trace of version 2$"):
+        with pytest.raises(TraceError, match=r"columns are not those of a trace of version 3$"):
             trace.read(other)
     lacking = {k: v for k, v in meta.items() if k != b"seed"}
     pq.write_table(table.replace_schema_metadata(lacking), other)

@@ -133,15 +133,12 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
 
 def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str], str]:
     """Layer and cause, and the evidence."""
-    intervals, x, y = judged(trace), trace["base_x"], trace["base_y"]
-    # Near a pillar a robot may be held up by it.
-    held, at_trench = np.zeros(len(x), dtype=bool), False
+    intervals = judged(trace)
+    held, at_trench = held_up(trace, tile, hips), False
     if tile is not None:
-        held = to_pillars(tile, x, y).min(axis=1, initial=np.inf) < hips + REACH
-        away = to_trenches(tile, x[-1]).min(initial=np.inf)
+        away = to_trenches(tile, trace["base_x"][-1]).min(initial=np.inf)
         at_trench = bool(away < hips + REACH) and trace.outcome != "left_tile"
-    # Against a pillar or over the edge nothing is tracked, and that is no fault of who tracks.
-    errors = tracking_errors(trace, intervals & ~(held | near_edge(trace, hips))[1:])
+    errors = tracking_errors(trace, intervals & free(trace, tile, hips))
     limits = {
         name: limit.episode if trace.outcome == "timeout" else limit.stretch
         for name, limit in LIMITS.items()
@@ -220,6 +217,20 @@ def has_looked(trace: Trace) -> bool:
     """Whether the decisions looked at any cue of the terrain."""
     told = any(family is not None for family in trace["family"])
     return told or bool(np.isfinite(trace["probe_00"]).any())
+
+
+def held_up(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
+    """Where the trunk was so near to a pillar that it may have been held up by it, (n,)."""
+    x, y = trace["base_x"], trace["base_y"]
+    if tile is None:
+        return np.zeros(len(x), dtype=bool)
+    return np.asarray(to_pillars(tile, x, y).min(axis=1, initial=np.inf) < hips + REACH)
+
+
+def free(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
+    """Intervals, (n - 1,), in which tracking is judged: against a pillar or over the edge nothing
+    is tracked, and that is no fault of who tracks."""
+    return ~(held_up(trace, tile, hips) | near_edge(trace, hips))[1:]
 
 
 def near_edge(trace: Trace, hips: float) -> NDArray[np.bool_]:

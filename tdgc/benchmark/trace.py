@@ -41,7 +41,7 @@ from tdgc.tasks.probes import NUM_PROBES, PROBES
 from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
 
 FORMAT = "tdgc-trace"
-VERSION = 2
+VERSION = 3
 
 
 class TraceError(InputError):
@@ -78,9 +78,9 @@ def _columns() -> Iterator[Column]:
     yield Column("goal_distance", "m", "from the trunk to the goal")
     yield Column("goal_bearing", "rad", "of the goal against the heading, to the left positive")
     yield Column("family", "", "cue: the terrain family that the high policy was told")
-    for name, (x, y) in zip(_PROBES, PROBES["lines"], strict=True):
-        where = f"({x:g}, {y:g}) m ahead and to the left"
-        yield Column(name, "m", f"cue: ground {where}, against where a standing robot's would be")
+    for i, name in enumerate(_PROBES):
+        meaning = f"cue: ground under probe {i}, against where a standing robot's would be"
+        yield Column(name, "m", meaning)
     for name in _ACTIONS:
         yield Column(name, "1", "action of the policy, before it is decoded")
     for name, unit in zip(NAMES, UNITS, strict=True):
@@ -124,9 +124,11 @@ class Trace(EpisodeRecord):
     Attributes:
         columns: name -> (n,) float32, or str and None in columns of names; n - 1 decisions and the
             end. NaN stands for null.
+        probes: where the policy's probes are, see ``probe_places``; empty of one that has none.
     """
 
     columns: dict[str, NDArray[Any]]
+    probes: str = ""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.columns[name]
@@ -159,6 +161,11 @@ def command_columns(
         at = (command[:, j] >= high - rounding).astype(float)
         columns[f"at_bound_{name}"] = at - (command[:, j] <= low + rounding)
     return columns
+
+
+def probe_places(points: Array) -> str:
+    """Where probes (n, 2) are, in m ahead and to the left: ``0.1,0 0.15,0`` and so on."""
+    return " ".join(f"{x:g},{y:g}" for x, y in points)
 
 
 def probe_columns(heights: Array) -> dict[str, NDArray[Any]]:
@@ -214,7 +221,8 @@ class Tracer:
         """The traces of the batch that was watched last, in order."""
         if self._count.any():  # all ended between two decisions
             self._look()
-        cell, result = self._cell, []
+        cell, result, driver = self._cell, [], self._driver
+        places = "" if driver.probes is None else probe_places(PROBES[driver.config.probes])
         for k in range(cell.count):
             rows = self._rows[: self._decisions[k] + 1]
             columns: dict[str, NDArray[Any]] = {}
@@ -224,7 +232,7 @@ class Tracer:
                 if c.name in _DECIDED:  # a fellow robot's decision was noted beside its end
                     columns[c.name][-1] = None if kind is object else np.nan
             record = cell.record(k, self._seed, self._outcome[k])
-            result.append(Trace(**record, columns=columns))
+            result.append(Trace(**record, columns=columns, probes=places))
         return result
 
     # ------------------------------------------------------------------ a row

@@ -61,7 +61,9 @@ class HighLevelConfig:
     # does not tell feet that touch down from feet that take off.
     clock: Literal["sine", "both"] = field(default="both", metadata={"before": "sine"})
     # Where the heights of the geometric cue are probed, see ``tdgc.tasks.probes``.
-    probes: Literal["lines", "staggered"] = field(default="lines", metadata={"before": "staggered"})
+    probes: Literal["graded", "lines", "staggered"] = field(
+        default="lines", metadata={"before": "staggered"}
+    )
     # Whether it is told how old the probes' heights are, as a sensor's time stamp does.
     probe_age: bool = field(default=True, metadata={"before": False})
     # Whether it sees how fast the goal came nearer since the last decision. A leap is timed by the

@@ -23,6 +23,7 @@ from tdgc.benchmark.trace import (
     action_columns,
     command_columns,
     probe_columns,
+    probe_places,
     tilt,
 )
 from tdgc.deploy.controller import Controller
@@ -305,7 +306,9 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
         families = controller.high.table["families"]
         told_families = [families[i] for i in seen["family"][begin].argmax(axis=1)]
         fill(slice(-1), {"family": told_families})
+    places = ""
     if "probes" in seen:
+        places = probe_places(controller.high.table["probes"]["ahead_left"]["value"])
         fill(slice(-1), probe_columns(seen["probes"][begin]))
     seconds = log.time[end] - log.time[begin]
     errors = {
@@ -331,6 +334,7 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
         NO_TILE,
         outcome(log, controller, told),
         columns,
+        places,
     )
 
 

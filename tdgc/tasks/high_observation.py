@@ -120,7 +120,7 @@ def high_mirror(config: HighLevelConfig) -> Mirror:
     Raises:
         ConfigError: probes or bounds to one side that are not those to the other.
     """
-    if config.probes != "lines":
+    if config.probes == "staggered":
         raise ConfigError(
             f"probes that are {config.probes} are not the same on both sides, as a symmetric "
             "policy needs them; ppo.mirror=false does without symmetry"

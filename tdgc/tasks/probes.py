@@ -10,18 +10,21 @@ from tdgc.sim.sensors import Noise
 PROBE_RANGE = 0.5  # m, deeper and higher looks the same
 
 _AHEAD = [(0.1 + 0.05 * i, 0.0) for i in range(20)]
+_FURTHER = _AHEAD[:14] + [(0.825 + 0.075 * i, 0.0) for i in range(6)]
 _ASIDE = [(0.2 * i - 0.1, side * (0.2, 0.4)[i % 2]) for i in range(6) for side in (1.0, -1.0)]
 #: Where the probes are: 32 points (x ahead, y to the left) in m in the heading frame. Those of
-#: ``lines`` are the same on both sides: an edge across the way is found to 5 cm a metre ahead, and
-#: no pillar, 20 cm wide at least, slips between lines 20 cm apart as they sweep over the ground,
-#: beside the trunk, too: who leans on one has to know where it is.
-#: ``staggered`` is how the first policies looked ahead.
+#: ``graded`` are the same on both sides. Ahead of the feet an edge across the way is found to 5 cm,
+#: where a leap is timed, and to 7.5 cm further on, up to 1.2 m: a robot that leaps needs that much
+#: to get into its stride (docs/experiments.md). No pillar, 20 cm wide at least, slips between lines
+#: 20 cm apart as they sweep over the ground, beside the trunk, too: who leans on one has to know
+#: where it is. Earlier policies looked along ``lines`` of 5 cm, and the first along ``staggered``.
 PROBES: dict[str, Array] = {
+    "graded": np.array(_FURTHER + _ASIDE),
     "lines": np.array(_AHEAD + _ASIDE),
     "staggered": np.array([(0.05 * i - 0.25, (0.1, -0.3, 0.3, -0.1)[i % 4]) for i in range(32)]),
 }
 NUM_PROBES = 32
-#: Which of ``lines`` is each one's mirror image.
+#: Which of ``graded``, or of ``lines``, is each one's mirror image.
 PROBE_SWAP = (*range(20), *(20 + i + (1, -1)[i % 2] for i in range(12)))
 
 

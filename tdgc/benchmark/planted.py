@@ -1,0 +1,219 @@
+"""Faults planted in a pair: does the diagnosis blame the layer that is at fault, and do its limits
+fit the pair?
+
+    python -m tdgc.benchmark.planted
+    python -m tdgc.benchmark.planted --low runs/low/policy --high runs/high/policy
+
+Prints, for each fault and family, how many failures were blamed on the right layer, and what the
+errors of tracking stay below where nothing is wrong (docs/trace.md).
+"""
+
+import argparse
+import functools
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdgc.benchmark.diagnosis import LIMITS, LOOK_BACK, SETTLE, diagnose, free, tracking_errors
+from tdgc.benchmark.drivers import BaselineDriver, Decides, Driver, HierarchyDriver, load_high
+from tdgc.benchmark.evaluation import Cell, run_cell, tile_of
+from tdgc.benchmark.trace import Trace, Tracer
+from tdgc.config import HighLevelConfig
+from tdgc.policies import Policy
+from tdgc.sim.commands import INDEX
+from tdgc.sim.geometry import JOINTS, read_geometry
+from tdgc.sim.locomotion import Locomotion
+from tdgc.sim.observation import columns
+from tdgc.sim.robot import Array
+from tdgc.sim.terrain import FAMILIES
+from tdgc.tasks.high_observation import high_layout
+from tdgc.tasks.pairing import PRETRAINED, load_low
+
+SEED = 11  # of the tiles for faults; limits are measured on others
+EPISODES = 4  # of each fault and family
+#: Hard enough that a fault shows, easy enough that nothing else does.
+LEVELS = dict.fromkeys(FAMILIES, 6) | {"rough": 4}
+LIMIT_SEEDS, LIMIT_LEVELS, LIMIT_EPISODES = (1, 2), (6, 8), 5
+_SHARE = 95  # per cent of what succeeds, that stays below a limit
+_WEAK = 0.02  # of a motor's strength
+
+
+class WeakMotor(HierarchyDriver):
+    """One motor of every robot has lost its strength; ``joint`` is one of ``JOINTS``."""
+
+    def __init__(self, high: Decides, config: HighLevelConfig, joint: str) -> None:
+        super().__init__(high, config)
+        self._joint = JOINTS.index(joint)
+
+    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
+        super().begin(loco, goal, *told)
+        strength = np.tile(loco.world.strength, (1, len(JOINTS)))
+        strength[:, self._joint] = _WEAK
+        loco.world.strength = strength
+
+
+class SwappedBounds(HierarchyDriver):
+    """The decoder's bounds of a command are the wrong way round."""
+
+    def __init__(self, high: Decides, config: HighLevelConfig, command: str) -> None:
+        super().__init__(high, config)
+        decoder, j = self._decoder, INDEX[command]
+        decoder.low[j], decoder.high[j] = decoder.high[j], decoder.low[j]
+
+
+class Blindfold(HierarchyDriver):
+    """The high policy sees flat ground of an unknown family and a goal where there is none."""
+
+    def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
+        angle = np.random.default_rng(0).uniform(-np.pi, np.pi, loco.num_robots)
+        here = loco.world.state.position[:, :2]
+        c, s = np.cos(angle), np.sin(angle)
+        x, y = (goal - here).T
+        turned = here + np.stack([c * x - s * y, s * x + c * y], axis=1)
+        super().begin(loco, turned, "unknown")
+
+    def _observe(self, decision: int) -> Any:
+        seen = super()._observe(decision)
+        probes = columns(high_layout(self.config)).get("probes")
+        if probes is not None:
+            seen[:, probes] = 0.0
+        return seen
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a pair.
+
+    Attributes:
+        name: in words.
+        layer: that is to blame, one of ``LAYERS``.
+        plant: the driver of a high policy and its MDP, with the fault.
+    """
+
+    name: str
+    layer: str
+    plant: Callable[[Decides, HighLevelConfig], HierarchyDriver]
+
+
+FAULTS = (
+    *(
+        Fault(
+            f"{what} motor at {100 * _WEAK:g} % strength",
+            "execution",
+            functools.partial(WeakMotor, joint=joint),
+        )
+        for what, joint in (
+            ("a hip's", "FL_hip_joint"),
+            ("a thigh's", "FL_thigh_joint"),
+            ("a front calf's", "FL_calf_joint"),
+            ("a rear calf's", "RR_calf_joint"),
+        )
+    ),
+    *(
+        Fault(
+            f"bounds of {name} swapped", "decisions", functools.partial(SwappedBounds, command=name)
+        )
+        for name in ("vx", "vy", "yaw_rate")
+    ),
+    Fault("a blindfolded high policy", "decisions", Blindfold),
+)
+
+
+def traced(
+    driver: Driver, low: Policy, family: str, level: int, count: int, seed: int
+) -> list[Trace]:
+    """Traces of the first ``count`` episodes of a cell."""
+    tracer = Tracer(driver, seed)
+    run_cell(Cell("planted", "nominal", family, level, 0, count), low, driver, seed, [tracer])
+    return tracer.traces()
+
+
+def blamed(
+    driver: Driver, low: Policy, family: str, level: int, count: int, hips: float
+) -> list[str]:
+    """The layers that the failures of a cell are blamed on."""
+    traces = traced(driver, low, family, level, count, SEED)
+    return [diagnose(t, hips).layer for t in traces if t.outcome != "reached"]
+
+
+def stretches(trace: Trace) -> Iterator[NDArray[np.bool_]]:
+    """An episode's intervals, (n - 1,), in stretches of ``LOOK_BACK`` s from ``SETTLE`` on."""
+    begins, end = trace["time"][:-1], trace["time"][-1]
+    for start in np.arange(SETTLE, end - LOOK_BACK + 1e-6, LOOK_BACK):
+        yield (begins > start - 1e-6) & (begins < start + LOOK_BACK - 1e-6)
+
+
+def measured_limits(traces: Sequence[Trace], hips: float) -> Mapping[str, tuple[float, float]]:
+    """What 95 % of the errors stay below, of stretches and of whole episodes that succeed: by the
+    names of ``LIMITS``."""
+    errors: dict[tuple[str, bool], list[float]] = defaultdict(list)
+    for trace in traces:
+        tile = tile_of(trace.seed, trace.family, trace.level, trace.episode, trace.condition)
+        clear = free(trace, tile, hips)
+        whole = trace["time"][:-1] > SETTLE - 1e-6
+        for is_whole, intervals in ((True, whole), *((False, s) for s in stretches(trace))):
+            for name, error in tracking_errors(trace, intervals & clear).items():
+                errors[name, is_whole].append(error)
+    return {
+        name: (
+            float(np.percentile(errors[name, False], _SHARE)),
+            float(np.percentile(errors[name, True], _SHARE)),
+        )
+        for name in LIMITS
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m tdgc.benchmark.planted",
+        description="Faults planted in a pair: does the diagnosis blame the layer at fault?",
+    )
+    shipped = {name: PRETRAINED / name for name in ("low", "high")}
+    for name, path in shipped.items():
+        parser.add_argument(f"--{name}", type=Path, default=path, help=f"{name} policy (shipped)")
+    args = parser.parse_args(arguments)
+    try:
+        low, low_config = load_low(args.low)
+        pair = load_high(args.high, low, low_config)
+    except (ValueError, OSError) as error:
+        print(f"tdgc.benchmark.planted: {error}", file=sys.stderr)
+        return 2
+    hips = float(read_geometry(low_config.robot).hips[0, 0])
+    print("fault".ljust(38) + "layer".ljust(11) + "".join(f"{name:>9}" for name in FAMILIES))
+    right = total = 0
+    for fault in FAULTS:
+        line = fault.name.ljust(38) + fault.layer.ljust(11)
+        for family in FAMILIES:
+            layers = blamed(fault.plant(*pair), low, family, LEVELS[family], EPISODES, hips)
+            line += f"{layers.count(fault.layer)} of {len(layers)}".rjust(9)
+            right, total = right + layers.count(fault.layer), total + len(layers)
+        print(line, flush=True)
+    print(f"{right} of {total} failures blamed on the layer at fault")
+    walked = [
+        trace
+        for driver in (HierarchyDriver(*pair), BaselineDriver(bounds=low_config.commands))
+        for seed in LIMIT_SEEDS
+        for family in FAMILIES
+        for level in LIMIT_LEVELS
+        for trace in traced(driver, low, family, level, LIMIT_EPISODES, seed)
+        if trace.outcome == "reached"
+    ]
+    print(f"\nwithout a fault, {_SHARE} % of {len(walked)} episodes that reached their goals")
+    print("error".ljust(11) + f"{f'{LOOK_BACK:g} s':>12}{'limit':>8}{'episode':>12}{'limit':>8}")
+    for name, (stretch, episode) in measured_limits(walked, hips).items():
+        limit = LIMITS[name]
+        print(
+            f"{name.ljust(11)}{stretch:>6.2f} {limit.unit:<5}{limit.stretch:>8.2f}"
+            f"{episode:>6.2f} {limit.unit:<5}{limit.episode:>8.2f}"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
