@@ -45,8 +45,8 @@ def test_they_are_the_same_on_both_sides_and_close_enough() -> None:
     assert len(POINTS) == NUM_PROBES == 32
     np.testing.assert_allclose(POINTS[list(PROBE_SWAP)] * [1.0, -1.0], POINTS, atol=1e-12)
     ahead = np.sort(POINTS[POINTS[:, 1] == 0.0, 0])
-    np.testing.assert_allclose(np.diff(ahead), 0.05)
-    assert ahead[0] == 0.1 and ahead[-1] == pytest.approx(1.05)
+    np.testing.assert_allclose(np.diff(ahead), [*[0.05] * 13, *[0.075] * 6])
+    assert ahead[0] == 0.1 and ahead[-1] == pytest.approx(1.2)
     np.testing.assert_allclose(np.unique(POINTS[:, 1]), [-0.4, -0.2, 0.0, 0.2, 0.4])
 
 

@@ -62,7 +62,7 @@ class HighLevelConfig:
     clock: Literal["sine", "both"] = field(default="both", metadata={"before": "sine"})
     # Where the heights of the geometric cue are probed, see ``tdgc.tasks.probes``.
     probes: Literal["graded", "lines", "staggered"] = field(
-        default="lines", metadata={"before": "staggered"}
+        default="graded", metadata={"before": "staggered"}
     )
     # Whether it is told how old the probes' heights are, as a sensor's time stamp does.
     probe_age: bool = field(default=True, metadata={"before": False})
@@ -73,8 +73,11 @@ class HighLevelConfig:
     # have to do: tiles of several families, or of none that has a name.
     unknown_share: Share = 0.2
     # Trenches, which are leapt to a few centimetres, take twice the robots of the others.
-    # Clutter stands for ground that no other family resembles (docs/experiments.md).
-    families: tuple[str, ...] = ("rough", "pillar", "stair", "gap", "gap", "tilt", "clutter")
+    # Clutter stands for ground that no other family resembles, and ditches for trenches behind and
+    # before other ground (docs/experiments.md).
+    families: tuple[str, ...] = (
+        "rough", "pillar", "stair", "gap", "gap", "tilt", "clutter", "ditches"
+    )  # fmt: skip
     levels: Count = 11  # L_max: levels 0..10
     # How levels are chosen in training: by each robot's performance, as the paper has it; drawn
     # uniformly for each episode; or always the hardest.

@@ -89,8 +89,8 @@ STYLES = {
     **dict.fromkeys(UNNAMED, UNEVEN),
 }
 
-#: m ahead that the probes see a trench; they reach 1.05 m.
-SIGHT = 1.0
+#: m ahead that the probes see a trench; they reach 1.2 m.
+SIGHT = 1.15
 
 # The way around pillars follows a field of travel costs on every second sample of the tile.
 _COARSE = 2
