@@ -249,6 +249,7 @@ def test_a_log_has_what_the_simulator_knows_but_its_truth(
     seen = log.trace(log.read(tmp_path / "walk.npz", controller), controller, "fell")
     assert (seen.policy, seen.condition, seen.family) == ("tdgc", "walk", "rough")
     assert (seen.seed, seen.level) == (NO_TILE, NO_TILE)
+    assert seen.probes == truth.probes and len(seen.probes.split()) == 32
     exact = [
         c.name for c in trace.COLUMNS if c.name.startswith(("action_", "command_", "at_bound_"))
     ]
