@@ -80,6 +80,11 @@ def test_limits_are_measured_where_nothing_is_wrong():
     assert velocity[1] == pytest.approx(np.percentile(errors, 95), abs=1e-6)
 
 
+def test_no_limits_without_an_episode_that_succeeded():
+    assert set(measured_limits([], HIPS)) == set(LIMITS)
+    assert np.isnan(list(measured_limits([], HIPS).values())).all()
+
+
 def test_the_table_of_planted_faults(monkeypatch, capsys):
     small = {
         "FAULTS": [f for f in planted.FAULTS if f.name.startswith("a front calf's")],

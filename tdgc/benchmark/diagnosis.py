@@ -110,9 +110,8 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
     """
     if trace.outcome == "reached":
         raise ValueError("an episode that reached its goal has not failed")
-    tile, place, feature = None, "", ""
-    if trace.seed != NO_TILE:
-        tile = tile_of(trace.seed, trace.family, trace.level, trace.episode, trace.condition)
+    tile, place, feature = tile_under(trace), "", ""
+    if tile is not None:
         x, y = float(trace["base_x"][-1]), float(trace["base_y"][-1])
         found = sorted(features(tile, x, y), key=lambda feature: feature[1])
         place, feature = place_of(x), f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
@@ -126,6 +125,13 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
         cause=cause,
         evidence=evidence,
     )
+
+
+def tile_under(trace: Trace) -> Tile | None:
+    """The tile of an episode; None where it was on none."""
+    if trace.seed == NO_TILE:
+        return None
+    return tile_of(trace.seed, trace.family, trace.level, trace.episode, trace.condition)
 
 
 # ---------------------------------------------------------------------------- which layer
@@ -178,7 +184,12 @@ def judged(trace: Trace) -> NDArray[np.bool_]:
     """
     time = trace["time"].astype(np.float64)
     last = time[1:] > (0.0 if trace.outcome == "timeout" else time[-1] - LOOK_BACK)
-    return np.asarray(last & (time[:-1] > SETTLE - 1e-6))
+    return np.asarray(last & settled(trace))
+
+
+def settled(trace: Trace) -> NDArray[np.bool_]:
+    """Intervals between decisions, (n - 1,), that begin after ``SETTLE``."""
+    return np.asarray(trace["time"][:-1].astype(np.float64) > SETTLE - 1e-6)
 
 
 def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, float]:

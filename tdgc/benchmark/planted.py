@@ -20,9 +20,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.benchmark.diagnosis import LIMITS, LOOK_BACK, SETTLE, diagnose, free, tracking_errors
+from tdgc.benchmark.diagnosis import (
+    LIMITS,
+    LOOK_BACK,
+    SETTLE,
+    diagnose,
+    free,
+    settled,
+    tile_under,
+    tracking_errors,
+)
 from tdgc.benchmark.drivers import BaselineDriver, Decides, Driver, HierarchyDriver, load_high
-from tdgc.benchmark.evaluation import Cell, run_cell, tile_of
+from tdgc.benchmark.evaluation import Cell, run_cell
 from tdgc.benchmark.trace import Trace, Tracer
 from tdgc.config import HighLevelConfig
 from tdgc.policies import Policy
@@ -151,22 +160,19 @@ def stretches(trace: Trace) -> Iterator[NDArray[np.bool_]]:
 
 def measured_limits(traces: Sequence[Trace], hips: float) -> Mapping[str, tuple[float, float]]:
     """What 95 % of the errors stay below, of stretches and of whole episodes that succeed: by the
-    names of ``LIMITS``."""
+    names of ``LIMITS``; nan where none was to be judged."""
     errors: dict[tuple[str, bool], list[float]] = defaultdict(list)
     for trace in traces:
-        tile = tile_of(trace.seed, trace.family, trace.level, trace.episode, trace.condition)
-        clear = free(trace, tile, hips)
-        whole = trace["time"][:-1] > SETTLE - 1e-6
+        clear, whole = free(trace, tile_under(trace), hips), settled(trace)
         for is_whole, intervals in ((True, whole), *((False, s) for s in stretches(trace))):
             for name, error in tracking_errors(trace, intervals & clear).items():
                 errors[name, is_whole].append(error)
-    return {
-        name: (
-            float(np.percentile(errors[name, False], _SHARE)),
-            float(np.percentile(errors[name, True], _SHARE)),
-        )
-        for name in LIMITS
-    }
+
+    def highest(name: str, is_whole: bool) -> float:
+        found = errors[name, is_whole]
+        return float(np.percentile(found, _SHARE)) if found else np.nan
+
+    return {name: (highest(name, False), highest(name, True)) for name in LIMITS}
 
 
 def main(arguments: list[str] | None = None) -> int:
