@@ -35,11 +35,12 @@ from tdgc.files import checksum
 from tdgc.policies import Policy
 from tdgc.sim.commands import CONTINUOUS, NAMES, UNITS, CommandDecoder, default_command
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
-from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
 from tdgc.sim.terrain import TileField, make_tile
+from tdgc.sim.urdf import JOINTS, urdf_path
 from tdgc.sim.world import World
 from tdgc.tasks.high_observation import SEMANTIC
 from tdgc.tasks.pairing import PRETRAINED, load_low

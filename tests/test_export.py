@@ -27,10 +27,10 @@ from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
 from tdgc.sim.commands import CommandDecoder
 from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
-from tdgc.sim.geometry import urdf_path
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import JOINTS, nominal_pose
+from tdgc.sim.urdf import urdf_path
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import Seen, high_layout, high_mirror
 from tdgc.tasks.low_observation import low_mirror

@@ -17,7 +17,7 @@ from tdgc.config import ConfigError, LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.deploy import graphs
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import PhaseClock, foot_phases, swing_profile
-from tdgc.sim.geometry import FRONT, JOINTS, SIDE, read_geometry, urdf_path
+from tdgc.sim.geometry import FRONT, SIDE, read_geometry
 from tdgc.sim.robot import (
     commanded_pose,
     fitted,
@@ -27,6 +27,7 @@ from tdgc.sim.robot import (
     rotation_matrix,
     walking_pose,
 )
+from tdgc.sim.urdf import JOINTS, merged_file, urdf_path
 from tdgc.sim.world import World
 from tdgc.tasks import rewards
 from tdgc.tasks.low_env import LowLevelTask
@@ -146,7 +147,7 @@ def test_a_robot_with_fixed_links(a1: RobotConfig) -> None:
     geometry = read_geometry(a1)
     assert geometry.hips.tolist() == read_geometry(RobotConfig()).hips.tolist()
     assert (geometry.abduction, geometry.thigh, geometry.calf) == (0.08505, 0.2, 0.2)
-    assert (geometry.foot_radius, geometry.trunk_mass) == (0.02, 4.713)
+    assert (geometry.foot_radius, geometry.trunk_mass) == (0.02, 4.714)  # an IMU of 1 g on it
     assert geometry.joint_limits[1].tolist() == [-1.0471975512, 4.18879020479]
 
 
@@ -300,6 +301,99 @@ def test_what_is_fixed_to_the_trunk_is_its_own(tmp_path: Path) -> None:
     world.close()
     assert state.trunk_force[0] > 100.0
     assert (state.leg_force == 0.0).all() and (state.foot_force == 0.0).all()
+
+
+TURNED = (
+    '<joint name="mast" type="fixed"><parent link="FL_thigh"/><child link="mast"/>'
+    '<origin xyz="0.03 -0.05 -0.1" rpy="0.4 -0.3 1.2"/></joint><link name="mast"><inertial>'
+    '<origin xyz="0.01 0.02 0.04" rpy="0.5 0.1 -0.7"/><mass value="0.8"/>'
+    '<inertia ixx="4e-3" iyy="3e-3" izz="2e-3" ixy="5e-4" ixz="-3e-4" iyz="2e-4"/></inertial>'
+    '<collision><origin xyz="0.1 0 0" rpy="0 0.6 0.2"/><geometry><box size="0.3 0.1 0.02"/>'
+    "</geometry></collision></link></robot>"
+)
+
+
+def by_itself(urdf: Path) -> tuple[np.ndarray, np.ndarray]:
+    """What Bullet makes of a URDF, without this package: joint angles and the trunk's pose over
+    0.2 s of random torques in the air (80, 19), and which of 400 rays from above hit it where."""
+    client, rng = pybullet.connect(pybullet.DIRECT), np.random.default_rng(0)
+    whole = pybullet.URDF_USE_INERTIA_FROM_FILE
+    body = pybullet.loadURDF(str(urdf), [0, 0, 1], flags=whole, physicsClientId=client)
+    links = range(pybullet.getNumJoints(body, client))
+    named = {pybullet.getJointInfo(body, k, client)[1].decode(): k for k in links}
+    joints = [named[name] for name in JOINTS]
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 20), np.linspace(-0.3, 0.3, 20))
+    above, below = (np.stack([x, y, np.full_like(x, z)], -1).reshape(-1, 3) for z in (2.0, 0.0))
+    pybullet.performCollisionDetection(client)  # before it shapes have no bounds
+    hits = pybullet.rayTestBatch(above.tolist(), below.tolist(), physicsClientId=client)
+    for k in (-1, *links):
+        pybullet.setCollisionFilterGroupMask(body, k, 0, 0, client)
+        pybullet.changeDynamics(
+            body, k, linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=client
+        )
+    pybullet.setJointMotorControlArray(
+        body, joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 12, physicsClientId=client
+    )
+    pybullet.setTimeStep(1 / 400, client)
+    path = []
+    for _ in range(80):
+        torque = rng.uniform(-3.0, 3.0, 12).tolist()
+        pybullet.setJointMotorControlArray(
+            body, joints, pybullet.TORQUE_CONTROL, forces=torque, physicsClientId=client
+        )
+        pybullet.stepSimulation(client)
+        angles = [state[0] for state in pybullet.getJointStates(body, joints, client)]
+        hip = pybullet.getLinkState(body, joints[0], 0, 1, client)
+        path.append([*angles, *hip[4], *hip[5]])
+    pybullet.disconnect(client)
+    return np.array(path), np.array([hit[2] for hit in hits])
+
+
+@pytest.mark.parametrize("which", ["a1", "turned"])
+def test_what_is_fixed_moves_with_its_carrier(
+    which: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """As in Bullet, which simulates a link of its own instead."""
+    config = changed(tmp_path, ("</robot>", TURNED)) if which == "turned" else None
+    config = config or request.getfixturevalue("a1")
+    with merged_file(config) as merged:
+        assert merged.read_text(encoding="utf-8").count("<link ") == 13
+        (one, seen), (other, seen_too) = by_itself(urdf_path(config)), by_itself(merged)
+    assert not merged.exists()
+    assert np.ptp(one, axis=0).max() > 0.3 and (seen < 1.0).sum() > 50
+    np.testing.assert_allclose(other, one, atol=1e-5)
+    np.testing.assert_allclose(seen_too, seen, atol=1e-9)
+
+
+def test_nothing_fixed_nothing_written() -> None:
+    with merged_file(RobotConfig()) as merged:
+        assert merged == urdf_path(RobotConfig())
+
+
+def test_meshes_are_found_from_elsewhere(tmp_path: Path) -> None:
+    """Relative to the URDF or to a package; others stay as they are, for Bullet to say so."""
+    (tmp_path / "dog" / "urdf").mkdir(parents=True)
+    (tmp_path / "dog" / "hull.stl").touch()
+    (tmp_path / "dog" / "urdf" / "mast.stl").touch()
+    names = ("mast.stl", "../hull.stl", "package://dog/hull.stl", "hull.stl", "package://dog/x.stl")
+    shapes = "".join(
+        f'<visual><geometry><mesh filename="{name}"/></geometry></visual>' for name in names
+    )
+    path = tmp_path / "dog" / "urdf" / "dog.urdf"
+    path.write_text(
+        SHIPPED.replace("</robot>", TURNED.replace("<collision>", shapes + "<collision>"))
+    )
+    with merged_file(RobotConfig(urdf=str(path))) as merged:
+        found = re.findall('mesh filename="(.*?)"', merged.read_text())
+    assert [Path(name).is_file() for name in found] == [True, True, True, False, False]
+    assert found[3:] == ["hull.stl", "package://dog/x.stl"]
+
+
+def test_what_is_fixed_needs_an_inertia(tmp_path: Path) -> None:
+    bare = re.sub("<inertia .*?/>", "", TURNED)
+    config = changed(tmp_path, ("</robot>", bare))
+    with pytest.raises(ConfigError, match=r"changed\.urdf: link 'mast': inertial/inertia ixx must"):
+        World(1, config, PhysicsConfig())
 
 
 def test_leg_angles_of_another_robot(robot: RobotConfig) -> None:

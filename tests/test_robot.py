@@ -14,7 +14,7 @@ import pytest
 from tdgc.config import RobotConfig
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import FEET, GAIT_TABLE, foot_phases, swing_profile
-from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import (
     HIGHEST_FOOT,
     Array,
@@ -35,6 +35,7 @@ from tdgc.sim.robot import (
     wrap_angle,
     yaw_quaternion,
 )
+from tdgc.sim.urdf import JOINTS, urdf_path
 
 CONFIG = RobotConfig()
 URDF, GEOMETRY = urdf_path(CONFIG), read_geometry(CONFIG)

@@ -17,8 +17,9 @@ from tdgc.config import CommandRanges, RobotConfig
 from tdgc.deploy.interface import ExportError, Table, read_interface
 from tdgc.files import checksum
 from tdgc.sim.commands import CONTINUOUS
-from tdgc.sim.geometry import JOINTS, read_geometry
+from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import NUM_JOINTS, Array, RobotState, nominal_height, nominal_pose
+from tdgc.sim.urdf import JOINTS
 
 #: Formats of graphs and the suffixes of their files.
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
-from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import GRAVITY, Array, RobotState, pd_torque, rotation_matrix
 from tdgc.sim.terrain import TileField
+from tdgc.sim.urdf import JOINTS, urdf_path
 from tdgc.sim.world import WindowError, World, check_display
 
 _CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from tdgc.config import RobotConfig
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import swing_profile
-from tdgc.sim.geometry import FRONT, JOINTS, SIDE, Geometry, read_geometry
+from tdgc.sim.geometry import FRONT, SIDE, Geometry, read_geometry
+from tdgc.sim.urdf import JOINTS
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
-from tdgc.sim.geometry import JOINTS, read_geometry, urdf_path
+from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import (
     GRAVITY,
     NUM_JOINTS,
@@ -30,8 +30,10 @@ from tdgc.sim.robot import (
     rotation_matrix,
 )
 from tdgc.sim.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
+from tdgc.sim.urdf import JOINTS, merged_file, urdf_path
 
 _GROUND, _ROBOT = 1, 2  # collision groups: robots meet the ground and nothing else
+_TRUNK = -1  # Bullet's number of a body's root link
 _PARKED = 50.0  # m above its place nothing touches a robot: terrain stays within HEIGHT_RANGE
 _SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out from it
 _FOOT_REACH = 0.03  # m below the foot's centre sits a contact that is the foot's, not the calf's
@@ -120,29 +122,34 @@ class World:
         self._bodies: list[int] = []
         self._client_of: list[_Client] = []
         parts = -(-num_robots // CLIENT_ROBOTS)
-        for rows in np.array_split(np.arange(num_robots), parts):
-            client = _Client((int(rows[0]), int(rows[-1]) + 1), window)
-            client.setGravity(0.0, 0.0, -GRAVITY)
-            # No early stop of the solver: it would couple robots through the worst residual.
-            client.setPhysicsEngineParameter(
-                fixedTimeStep=physics.hold * physics.dt,
-                numSubSteps=physics.hold if physics.hold > 1 else 0,
-                numSolverIterations=physics.solver_iterations,
-                solverResidualThreshold=0.0,
-                deterministicOverlappingPairs=1,
-            )
-            self._make_ground(client)
-            for k in range(len(rows)):
-                self._bodies.append(self._load_robot(client, k))
-                self._client_of.append(client)
-                client.rows[self._bodies[-1]] = int(rows[k])
-            self._clients.append(client)
+        with merged_file(robot) as urdf:
+            for rows in np.array_split(np.arange(num_robots), parts):
+                self._connect(rows, urdf, window)
         self._joint_inertia = [self._inertia_about_joint(joint) for joint in self._joints]
-        trunk = self._client_of[0].getDynamicsInfo(self._bodies[0], -1)
+        trunk = self._client_of[0].getDynamicsInfo(self._bodies[0], _TRUNK)
         # Bullet's pose of a robot is that of its trunk's inertia: where its centre of mass is in
         # the trunk's frame, and how the axes of its inertia are turned there.
         self._trunk_inertia, self._centre, self._axes = map(np.array, trunk[2:5])
         self._active = np.arange(num_robots)
+
+    def _connect(self, rows: NDArray[np.int64], urdf: Path, window: bool) -> None:
+        """Give the robots ``rows`` (n,) a client, with their ground."""
+        client = _Client((int(rows[0]), int(rows[-1]) + 1), window)
+        client.setGravity(0.0, 0.0, -GRAVITY)
+        # No early stop of the solver: it would couple robots through the worst residual.
+        client.setPhysicsEngineParameter(
+            fixedTimeStep=self.physics.hold * self.physics.dt,
+            numSubSteps=self.physics.hold if self.physics.hold > 1 else 0,
+            numSolverIterations=self.physics.solver_iterations,
+            solverResidualThreshold=0.0,
+            deterministicOverlappingPairs=1,
+        )
+        self._make_ground(client)
+        for k in range(len(rows)):
+            self._bodies.append(self._load_robot(client, k, urdf))
+            self._client_of.append(client)
+            client.rows[self._bodies[-1]] = int(rows[k])
+        self._clients.append(client)
 
     def _make_ground(self, client: _Client) -> None:
         if self.field is None:
@@ -210,37 +217,27 @@ class World:
         for client in dict.fromkeys(self._client_of[i] for i in rows):
             self._upload(client, self.field.heights[client.samples], client.shape)
 
-    def _load_robot(self, client: _Client, place: int) -> int:
+    def _load_robot(self, client: _Client, place: int, urdf: Path) -> int:
         # Apart and high, so that nothing touches before the first reset.
-        path = urdf_path(self.robot)
         try:
             body = client.loadURDF(
-                str(path),
+                str(urdf),
                 basePosition=[2.0 * place, 0.0, _PARKED],
                 flags=pybullet.URDF_USE_INERTIA_FROM_FILE
                 | (0 if self._visual else pybullet.URDF_IGNORE_VISUAL_SHAPES),
             )
         except pybullet.error as error:  # a mesh that is not there, an element it cannot read
+            path = urdf_path(self.robot)
             raise ConfigError(f"{path}: Bullet cannot load it and says why above") from error
-        joints = [client.getJointInfo(body, j) for j in range(client.getNumJoints(body))]
-        found = {joint[1].decode(): joint[0] for joint in joints}
+        links = range(client.getNumJoints(body))
+        found = {client.getJointInfo(body, link)[1].decode(): link for link in links}
         self._joints = [found[name] for name in JOINTS]
-        # What is fixed to a link belongs to it. Bullet's own URDF_MERGE_FIXED_LINKS is of no use:
-        # it takes the carrying link's centre of mass for its origin.
-        carrier = {-1: -1}
-        for joint in joints:  # parents come first
-            fixed = joint[2] == pybullet.JOINT_FIXED
-            carrier[joint[0]] = carrier[joint[16]] if fixed else joint[0]
-        self._trunk_links = [link for link, moved in carrier.items() if moved < 0]
-        self._leg_of_link = {
-            link: self._joints.index(moved) // 3 for link, moved in carrier.items() if moved >= 0
-        }
-        calves = self._joints[2::3]
-        self._calf_links = {link for link, moved in carrier.items() if moved in calves}
+        self._leg_of_link = {link: k // 3 for k, link in enumerate(self._joints)}
+        self._calf_links = set(self._joints[2::3])
         # Bullet holds one speed limit a body, so it gets the slowest joint's: a calf that whips at
         # the other joints' 30 rad/s moves its foot further a step than the foot's radius.
         slowest = min(self.robot.speed_limit)
-        for link in carrier:
+        for link in (_TRUNK, *links):
             client.setCollisionFilterGroupMask(body, link, _ROBOT, _GROUND)
             client.changeDynamics(
                 body,
@@ -360,7 +357,7 @@ class World:
         for k, i in enumerate(np.asarray(index)):
             body, client = self._bodies[i], self._client_of[i]
             mass = nominal + float(payload[k])
-            for link in (*self._trunk_links, *self._leg_of_link):
+            for link in (_TRUNK, *sorted(self._joints)):
                 client.changeDynamics(body, link, lateralFriction=float(friction[k]))
             for joint, (inertia, axis) in zip(self._joints, self._joint_inertia, strict=True):
                 about = inertia.copy()
@@ -369,7 +366,7 @@ class World:
             # Spread over the trunk, the payload scales its inertia.
             client.changeDynamics(
                 body,
-                -1,
+                _TRUNK,
                 mass=mass,
                 localInertiaDiagonal=(self._trunk_inertia * (mass / nominal)).tolist(),
             )
@@ -445,10 +442,9 @@ class World:
                 for k in (0, 1)
             )
             pressed: dict[int, float] = {}  # row -> N on its trunk, none most of the time
-            for link in self._trunk_links:
-                for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=link):
-                    row = client.rows[contact[2]]
-                    pressed[row] = pressed.get(row, 0.0) + self._force(contact)
+            for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=_TRUNK):
+                row = client.rows[contact[2]]
+                pressed[row] = pressed.get(row, 0.0) + self._force(contact)
             for row, force in pressed.items():
                 state.trunk_force[row] = max(force, state.trunk_force[row])
         state.q[live], state.qd[live], state.torque[live] = q, qd, torque
