@@ -51,7 +51,7 @@ POLICIES = ("tdgc", "gp")
 TEACHER = "teacher"
 CUES = "cues"
 ALL_POLICIES = (*POLICIES, CUES, TEACHER)
-TUNED = "tdgc-tuned"  # beside "tdgc" where there is a tuning
+TUNED = "tdgc-tuned"  # evaluated beside "tdgc" if there is a tuning
 SHIPPED_HIGH = PRETRAINED / "high"
 
 
@@ -104,19 +104,19 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is evaluated, and what is looked at.
+    """The options of an evaluation: what is run and what is shown of it.
 
     Attributes:
         mode: a table of episodes; the low policy's tracking; or Bullet's window, to drive or watch.
-        policies, conditions, families, levels: names and numbers, each once.
-        episodes: of a cell.
-        low, high: policies' files.
+        policies, conditions, families, levels: names and numbers, without duplicates.
+        episodes: number per cell.
+        low, high: files of the policies.
         seed: of the evaluation's tiles.
-        tuning: that ``tdgc`` is compared with; None for none.
-        traced: whose traces are written; None without traces and diagnoses.
-        filmed: films of so many episodes of each cell.
+        tuning: to be compared with the untuned ``tdgc``; None for no comparison.
+        traced: which episodes' traces are written; None for no traces and no diagnoses.
+        filmed: number of episodes of each cell that are filmed.
         cluster: address of a cluster that runs the episodes; None for this machine.
-        workers: processes.
+        workers: number of processes.
         out: results folder.
 
     Raises:
@@ -175,10 +175,10 @@ class Evaluation:
 
     @classmethod
     def of(cls, flags: argparse.Namespace) -> "Evaluation":
-        """What the flags ask for.
+        """Build the evaluation that the flags ask for.
 
         Raises:
-            ValueError: flags that cannot be read, or an evaluation that cannot be.
+            ValueError: flags that cannot be read, or an evaluation that is not possible.
             OSError: a file that cannot be read.
         """
         if flags.gui is not None and flags.tracking:
@@ -218,19 +218,20 @@ class Evaluation:
         )
         if flags.cluster is None:
             return evaluation
-        cores = cluster.connect(flags.cluster)  # only for what can be evaluated
+        cores = cluster.connect(flags.cluster)  # only once the evaluation is known to be valid
         return replace(evaluation, workers=cores) if automatic else evaluation
 
     @property
     def run_jobs(self) -> RunJobs:
-        """What shares jobs among processes, here or in the cluster."""
+        """The function that distributes jobs to processes, here or in the cluster."""
         return run_jobs if self.cluster is None else cluster.run_jobs
 
     def drivers(self, low: Policy, config: LowLevelConfig) -> dict[str, Driver]:
-        """What drives the robots under each policy, and under the tuned one after ``tdgc``.
+        """Make the driver of each policy; the tuned one follows ``tdgc``.
 
         Raises:
-            ValueError: a high policy that does not fit the low one, or a tuning that fits neither.
+            ValueError: a high policy that does not fit the low one, or a tuning that does not fit
+                them.
         """
         if self.mode == "tracking":
             return {}
@@ -253,8 +254,11 @@ class Evaluation:
         return drivers
 
     def make_room(self) -> None:
-        """Make the results folder; what an earlier table left goes away, as this one may not write
-        all of it."""
+        """Create the results folder.
+
+        For a table, it also deletes the files of an earlier one, because this one may not overwrite
+        all of them.
+        """
         self.out.mkdir(parents=True, exist_ok=True)
         if self.mode != "table":
             return
@@ -270,13 +274,13 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Ran:
-    """What came of a batch.
+    """The results of a batch.
 
     Attributes:
-        episodes: all of them.
-        recordings: of those that are filmed.
-        diagnoses: of failures, where traces are taken.
-        traces: that are written.
+        episodes: all of the batch.
+        recordings: of the episodes to be filmed.
+        diagnoses: of failures; empty if nothing is traced.
+        traces: those to be written.
     """
 
     episodes: list[Episode]
@@ -293,7 +297,7 @@ def run_one(
     filmed: int,
     traced: Selection | None,
 ) -> Ran:
-    """Run a batch. It writes nothing: it may run on another machine."""
+    """Run a batch. It writes no files, because it may run on another machine."""
     driver = drivers[cell.policy]
     recorder = Recorder(driver, seed, filmed)
     if traced is None:
@@ -313,7 +317,7 @@ def run_one(
 def run_table(
     evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver], trained_on: dict[str, int]
 ) -> list[str]:
-    """Run all cells and write everything; what is missing, a line each.
+    """Run all cells and write all results.
 
     Args:
         evaluation: what to run.
@@ -321,8 +325,11 @@ def run_table(
         drivers: of all policies, by name.
         trained_on: ``editions`` of the policies.
 
+    Returns:
+        What could not be written, one line each.
+
     Raises:
-        Exception: one of ``STOPS``; the table of what is complete is written.
+        Exception: one of ``STOPS``; the table of the complete cells is written first.
     """
     e, out = evaluation, evaluation.out
     cells = plan(list(drivers), e.conditions, e.families, e.levels, e.episodes)
@@ -368,7 +375,10 @@ def run_table(
 
 
 def editions(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> dict[str, int]:
-    """Of the benchmark, that the policies were trained on; those of the first do not say so."""
+    """Editions of the benchmark that the policies were trained on.
+
+    Policies that do not record an edition are of the first.
+    """
     used = {"low": low}
     if "tdgc" in drivers:
         assert evaluation.high is not None
@@ -377,7 +387,7 @@ def editions(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver])
 
 
 def print_effect(effect: dict[str, Any]) -> None:
-    """What a tuning changed: success, speed and energy beside those without it."""
+    """Print the effect of a tuning: success, speed and energy with and without it."""
     for condition, found in effect.items():
         print(f"\nwhat the tuning changes, {condition}")
         print("policy       success       speed      energy")
@@ -391,7 +401,7 @@ def print_effect(effect: dict[str, Any]) -> None:
 
 
 def run_tracking(evaluation: Evaluation, low: Policy) -> None:
-    """Measure the low policy alone, print what is found and write tracking.json."""
+    """Measure the low policy alone, print the results and write tracking.json."""
     e = evaluation
     result = tracking(low, e.episodes, e.seed, e.workers, e.run_jobs)
     (e.out / "tracking.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
@@ -405,7 +415,7 @@ def run_tracking(evaluation: Evaluation, low: Policy) -> None:
 
 
 def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> None:
-    """Show a robot on the first tile of the first family and level, until the window is closed."""
+    """Show a robot on the first tile of the first family and level until the window is closed."""
     policy, driver = next(iter(drivers.items()))
     cell = Cell(policy, "nominal", evaluation.families[0], evaluation.levels[0], 0, 1)
     try:
@@ -414,7 +424,7 @@ def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver
         else:
             gui.watch(low, driver, cell, evaluation.seed)
     except KeyboardInterrupt:
-        pass  # as good an end as closing the window
+        pass  # equivalent to closing the window
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -426,7 +436,7 @@ def main(arguments: list[str] | None = None) -> int:
         low, config = load_low(evaluation.low)
         read_geometry(config.robot)  # before the results of an earlier call are removed
         drivers = evaluation.drivers(low, config)
-        trained_on = editions(evaluation, low, drivers)  # now: a training may rewrite the file
+        trained_on = editions(evaluation, low, drivers)  # before training overwrites the file
         evaluation.make_room()
     except (ValueError, OSError) as error:
         fail(error)
@@ -439,13 +449,13 @@ def main(arguments: list[str] | None = None) -> int:
             problems = run_table(evaluation, low, drivers, trained_on)
         else:
             run_window(evaluation, low, drivers)
-    except (ConfigError, WindowError) as error:  # Bullet cannot load the robot, or has no window
+    except (ConfigError, WindowError) as error:  # Bullet cannot load the robot or open its window
         fail(error)
         return 2
     except STOPS as error:
         fail(what_stopped(error))
         if isinstance(error, KeyboardInterrupt):
-            sys.exit(1)  # and not return: what called this is to stop, too
+            sys.exit(1)  # instead of returning, so that the caller stops, too
         return 1
     for problem in problems:
         fail(problem)

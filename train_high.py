@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Train the recurrent high policy on top of a frozen low policy, level by level.
 
-python train_high.py                       the whole job, on the shipped low policy
+python train_high.py                       complete training, on runs/low/policy or the shipped one
 python train_high.py --low runs/low/policy
 python train_high.py --init tdgc/pretrained/high --set env.commands.vx=[-1,0.8]
 python train_high.py --resume --out runs/high
@@ -47,16 +47,18 @@ from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.teacher import STYLES
 from tdgc.tasks.tiles import check_families, check_levels
 
-_LED = 0.75  # of the imitation, so that a quarter is in what the apprentice itself leads to
-#: Where train_low.py leaves its policy by default.
+# Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
+# the apprentice alone drives, so that it learns in the states to which its own actions lead.
+_LED = 0.75
+#: Where train_low.py writes its policy by default.
 TRAINED_LOW = Path("runs/low/policy")
 
 
 def find_low() -> str:
-    """The low policy of a finished run of train_low.py, or else the shipped one.
+    """Find the low policy of a finished run of train_low.py, or else the shipped one.
 
     Raises:
-        PolicyFileError: what the run left cannot be read.
+        PolicyFileError: the run's policy cannot be read.
     """
     if TRAINED_LOW.with_suffix(".json").exists():
         if "calibration" in policies.load(TRAINED_LOW).meta:
@@ -66,10 +68,10 @@ def find_low() -> str:
 
 
 def pin_low(config: HighTrainConfig) -> HighTrainConfig:
-    """The configuration with the checksum of its low policy.
+    """Add the checksum of the low policy to the configuration.
 
     Raises:
-        ConfigError: it is another one than that the run began with.
+        ConfigError: the low policy is not the one that the run began with.
     """
     found = checksum(header_file(cast(str, config.low)))
     if config.low_sha256 not in (None, found):
@@ -78,10 +80,10 @@ def pin_low(config: HighTrainConfig) -> HighTrainConfig:
 
 
 def start_action(config: HighTrainConfig) -> Array:
-    """The action of walking straight on in the default gait, (13,).
+    """Compute the action for walking straight ahead in the default gait, (13,).
 
     Raises:
-        ConfigError: gaits that are none, or a speed or swing outside the decoder's bounds.
+        ConfigError: invalid gaits, or a speed or swing height outside the decoder's bounds.
     """
     decoder = CommandDecoder(config.env.commands, config.env.action_limit, config.env.gaits)
     command = decoder.nearest(default_command())
@@ -95,10 +97,10 @@ def start_action(config: HighTrainConfig) -> Array:
 
 
 def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
-    """Let the untrained policy's mean action be walking straight on in the default gait.
+    """Make walking straight ahead in the default gait the untrained policy's mean action.
 
-    Its exploration then stumbles on goals from the first episodes; around the middle of the bounds
-    it would stand still in a random gait.
+    Exploration then reaches goals by chance from the first episodes on. Around the middle of the
+    bounds the robot would stand still in a random gait.
     """
     with th.no_grad():
         head = policy.action_net
@@ -110,7 +112,7 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
 def make_env(
     config: HighTrainConfig, low: Policy, taught: bool, led: float, timeout: float, link: MakeLink
 ) -> TaskVecEnv:
-    """The workers; ``taught`` and ``led`` as ``NavigationTask`` has them."""
+    """Start the workers; ``taught`` and ``led`` as in ``NavigationTask``."""
     env_config, landing = config.env, None
     if taught and "gap" in env_config.families:
         landing = measure_landing(*load_low(low))
@@ -136,7 +138,10 @@ def make_learner(
     device: str,
     **changed: Any,
 ) -> FastRecurrentPPO:
-    """A recurrent learner that begins by walking straight on; ``changed`` are PPO's keywords."""
+    """Build a recurrent learner that starts by walking straight ahead.
+
+    ``changed`` overrides keyword arguments of PPO.
+    """
     ppo, exchange = config.ppo, None
     if ppo.memory_exchange:
         exchange = MemoryExchange(ppo.memory_exchange, untold_column(config.env))
@@ -170,7 +175,7 @@ def make_learner(
 def build_imitation(
     config: HighTrainConfig, low: Policy, device: str, timeout: float, link: MakeLink
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
-    """Workers with a teacher, and the apprentice."""
+    """Build the apprentice, and workers with a teacher."""
     imitation = config.imitation
     mdp = dataclasses.replace(
         config.env, curriculum=imitation.curriculum, first_levels=config.env.levels
@@ -190,7 +195,10 @@ def build_imitation(
 def build_reinforcement(
     config: HighTrainConfig, low: Policy, device: str, timeout: float, link: MakeLink
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
-    """Workers and learner of reinforcement learning, with a teacher if it goes on imitating."""
+    """Build the learner and workers of reinforcement learning.
+
+    They have a teacher if the imitation loss is kept.
+    """
     if begins_hardest(config):
         mdp = dataclasses.replace(config.env, first_level=config.env.levels - 1, first_levels=1)
         config = dataclasses.replace(config, env=mdp)
@@ -200,19 +208,19 @@ def build_reinforcement(
         FastRecurrentPPO, TaughtPolicy if taught else FastRecurrentPolicy, env, config, device
     )
     if taught:
-        # SB3 multiplies it by ``ent_coef``, with the entropy that it is a part of.
+        # The policy returns the loss as part of the entropy, which SB3 multiplies by ``ent_coef``.
         weight = config.ppo.imitation_coef / config.ppo.ent_coef
         cast(TaughtPolicy, model.policy).imitation_weight = weight
     return model, env
 
 
 def begins_hardest(config: HighTrainConfig) -> bool:
-    """Whether reinforcement learning begins on the hardest level."""
+    """Whether reinforcement learning starts on the hardest level."""
     return bool(config.imitation.steps) and config.imitation.levels_after == "hardest"
 
 
 def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
-    """Imitation of the teacher, if any, and then reinforcement learning."""
+    """Return the phases: imitation of the teacher, if any, then reinforcement learning."""
     imitated = min(config.imitation.steps, config.steps)
     both = (
         ("imitation", build_imitation, imitated, False),
@@ -226,10 +234,10 @@ def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
 
 
 def check(config: HighTrainConfig) -> None:
-    """Refuse settings that would fail later, or do nothing.
+    """Refuse settings that would fail later or have no effect.
 
     Raises:
-        ValueError: says which one, and what is allowed.
+        ValueError: names the setting and what is allowed.
     """
     env, ppo = config.env, config.ppo
     check_families(env.families)
@@ -240,7 +248,7 @@ def check(config: HighTrainConfig) -> None:
             f"'env.first_level' and 'env.first_levels' must leave robots on the {env.levels} "
             f"levels, not on {env.first_levels} from {env.first_level} up"
         )
-    if not ppo.ent_coef:  # SB3 multiplies what these weigh by it
+    if not ppo.ent_coef:  # SB3 multiplies both terms by it
         for name, used in (("gait_ent_coef", True), ("imitation_coef", config.imitation.steps)):
             if used and getattr(ppo, name):
                 raise ConfigError(f"'ppo.{name}' needs an 'ppo.ent_coef' above 0; or set it to 0")
@@ -271,7 +279,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     preset = (*PRESETS[args.preset], *(NO_TEACHER if args.no_teacher else ()))
     if args.init is not None:
-        preset += ("imitation.steps=0",)  # it would unlearn what it begins with
+        preset += ("imitation.steps=0",)  # imitation would overwrite what that policy has learned
     if args.low is not None:
         args.assignments.append(f"low={args.low}")
     try:

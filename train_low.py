@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Train the gait-conditioned low policy on a plane and on rising terrain, and calibrate it.
+"""Train the gait-conditioned low policy on a plane and on increasingly hard terrain; calibrate it.
 
-python train_low.py                        the whole job
-python train_low.py --time-limit 3600      an hour of it
+python train_low.py                        the complete training
+python train_low.py --time-limit 3600      stops after an hour
 python train_low.py --resume --out runs/low
 """
 
@@ -48,15 +48,15 @@ from tdgc.tasks.tiles import check_families, check_levels
 
 
 def phases(config: LowTrainConfig, device: str) -> list[Phase]:
-    """Robots on a plane and on tiles whose levels rise with success.
+    """Return the one phase of learning: robots on a plane, and on tiles with rising levels.
 
     Raises:
-        ConfigError: a share of the robots that is none.
+        ConfigError: ``plane_share`` is outside [0, 1).
     """
     if not 0.0 <= config.plane_share < 1.0:
         raise ConfigError(f"'plane_share' must be from 0 to below 1, not {config.plane_share:g}")
     env = config.env
-    # A plane lets nothing sink, so there a physics step may be as long as a torque is held.
+    # Feet cannot sink into a plane, so there a physics step may be as long as a torque is held.
     steps = env.physics.joint_steps
     physics = dataclasses.replace(env.physics, substeps=steps, hold=1)
     plane = dataclasses.replace(env, terrain="plane", physics=physics)
@@ -66,7 +66,7 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
 
 
 def fit(config: LowTrainConfig, assignments: Sequence[str]) -> LowTrainConfig:
-    """The configuration with what follows from another robot's URDF, but for what was assigned.
+    """Adapt the configuration to another robot's URDF; assigned settings are kept.
 
     Raises:
         ConfigError: a URDF that does not fit.
@@ -84,14 +84,14 @@ def fit(config: LowTrainConfig, assignments: Sequence[str]) -> LowTrainConfig:
 
 
 class StoppedError(Exception):
-    """Calibration was interrupted."""
+    """Raised when calibration is interrupted."""
 
 
 def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> None:
-    """The last phase: the calibrated copy takes the place of the policy that learned.
+    """Run the last phase: replace the trained policy by its calibrated copy.
 
-    What learned stays beside it as ``uncalibrated``. An interrupted calibration starts over when
-    the run is resumed, and ends the same.
+    The trained policy is kept as ``uncalibrated``. An interrupted calibration starts over when the
+    run is resumed, with the same result.
 
     Raises:
         WorkerError: a worker failed.
@@ -125,7 +125,7 @@ def build(
     timeout: float,
     link: MakeLink,
 ) -> tuple[PPO, TaskVecEnv]:
-    """Workers and learner of one phase."""
+    """Build the learner and its workers."""
     env = TaskVecEnv(
         functools.partial(make_task, env_config, config.plane_share),
         config.n_envs,

@@ -1,13 +1,13 @@
 """tdgc: hierarchical quadruped navigation, from task-level decisions to gait-level control.
 
-Importing the package registers its Gymnasium environments, the keys of ``ENVIRONMENTS``.
+Importing the package registers its Gymnasium environments, which ``ENVIRONMENTS`` lists.
 """
 
 import gymnasium
 
 __version__ = "0.1.0"
 
-#: Gymnasium id -> where its class is; the module is imported when an environment is made.
+#: Gymnasium id -> location of its class; the module is imported when an environment is made.
 ENVIRONMENTS = {
     "tdgc/LowLevel-v0": "tdgc.tasks.low_env:LowLevelEnv",
     "tdgc/Navigation-v0": "tdgc.tasks.high_env:NavigationEnv",

@@ -1,4 +1,4 @@
-"""Throughput of collecting: control steps a second, Bullet's share of it, memory a robot.
+"""Measure collecting: control steps per second, Bullet's share of the time, memory per robot.
 
     python -m tdgc.bench --out runs/bench
     python -m tdgc.bench --load
@@ -6,12 +6,12 @@
     python -m tdgc.bench --cluster auto
 
 Robots take random actions in the low policy's MDP, on a plane and on all levels of all families,
-with one worker and with all. Writes ``bench.json`` and prints a table. With ``--load`` there are
-10, 100 and 1000 robots on the plane, with 1 to 8 workers, and then the learner alone, with 1 to
-16 threads; the table is in ``load.json``. With ``--update`` the high policy's learner updates its
-networks by sb3-contrib's own pass and by the fast one; the table is in ``update.json``. With
-``--cluster`` robots on the plane are simulated by processes of this machine and by actors of Ray in
-turn; the table is in ``cluster.json``.
+with one worker and with all. The table is printed and written to ``bench.json``. With ``--load``
+there are 10, 100 and 1000 robots on the plane with 1 to 8 workers, and then the learner alone with
+1 to 16 threads; the table goes to ``load.json``. With ``--update`` the high policy's learner
+updates its networks by sb3-contrib's own pass and by the fast one; the table goes to
+``update.json``. With ``--cluster`` processes on this machine and Ray actors take turns simulating
+robots on the plane; the table goes to ``cluster.json``.
 """
 
 import argparse
@@ -50,16 +50,16 @@ from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 
 _COLUMNS = ("workers", "steps/s", "in Bullet", "MB/robot", "MB")
-UPDATES = 80  # turns of ``--update``: other work shares the cores
+UPDATES = 80  # turns of ``--update``: many, because other work shares the cores
 #: What ``--load`` compares.
 LOAD_ROBOTS, LOAD_WORKERS, LOAD_THREADS = (10, 100, 1000), (1, 2, 4, 8), (1, 2, 4, 8, 16)
-_SETTLE_STEPS = 20  # not timed: robots drop onto their feet
-_EPISODE = 100  # decisions, about the mean of the shipped high policy's training
+_SETTLE_STEPS = 20  # not timed, while robots drop onto their feet
+_EPISODE = 100  # decisions, about the mean in the shipped high policy's training
 _TURNS = 10  # of each place in a comparison
 
 
 def spread_levels(env: TaskVecEnv, levels: int) -> None:
-    """New episodes for all robots, spread over the levels as a training's are."""
+    """Begin new episodes for all robots, spread over the levels as in training."""
     env.load_state_dicts(
         [
             {**without_episodes(state), "level": np.arange(len(state["level"])) % levels}
@@ -76,7 +76,7 @@ def make_env(
 
 
 def settle(env: TaskVecEnv, levels: int) -> NDArray[np.float32]:
-    """Let the robots drop onto their feet; 64 random actions of all of them, (64, robots, 12)."""
+    """Let the robots drop onto their feet; return random actions to repeat, (64, robots, 12)."""
     spread_levels(env, levels)
     shape = (64, env.num_envs, NUM_JOINTS)
     actions = np.random.default_rng(0).normal(0.0, 1.0, shape).astype(np.float32)
@@ -86,7 +86,7 @@ def settle(env: TaskVecEnv, levels: int) -> NDArray[np.float32]:
 
 
 def collect(env: TaskVecEnv, actions: NDArray[np.float32], seconds: float) -> tuple[int, float]:
-    """Take steps for about ``seconds``: their number, and s."""
+    """Take steps for about ``seconds``; return their number and the time taken in s."""
     started, steps = time.perf_counter(), 0
     while time.perf_counter() - started < seconds:
         env.step(actions[steps % len(actions)])
@@ -97,8 +97,8 @@ def collect(env: TaskVecEnv, actions: NDArray[np.float32], seconds: float) -> tu
 def measure(config: LowLevelConfig, robots: int, workers: int, seconds: float) -> dict[str, float]:
     """Collect for about ``seconds``: steps_per_s, bullet_share, mb_per_robot, mb_total.
 
-    ``bullet_share`` is the time the workers spent inside Bullet's step over the time they spent
-    collecting, waiting for actions included.
+    ``bullet_share`` is the time the workers spent inside Bullet's step, divided by the time they
+    spent collecting, including waiting for actions.
     """
     env = make_env(config, robots, workers)
     try:
@@ -118,9 +118,10 @@ def measure(config: LowLevelConfig, robots: int, workers: int, seconds: float) -
 
 
 def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
-    """Control steps a second that the low policy's learner takes in, for about ``seconds``.
+    """Control steps per second that the low policy's learner processes, over about ``seconds``.
 
-    Each is taken ``n_epochs`` times, in minibatches, forwards and backwards through both networks.
+    Each step is processed ``n_epochs`` times, in minibatches, forwards and backwards through both
+    networks.
     """
     ppo, (observed, acted) = config.ppo, low_spaces(config.env)
     policy = AsymmetricActorCriticPolicy(
@@ -144,7 +145,7 @@ def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
     before = th.get_num_threads()
     th.set_num_threads(threads)
     try:
-        update()  # not timed: the first one makes the optimiser's state
+        update()  # not timed: the first update creates the optimiser's state
         started, updates = time.perf_counter(), 0
         while time.perf_counter() - started < seconds:
             update()
@@ -158,11 +159,13 @@ def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
 def update_seconds(
     config: HighTrainConfig, spaces: tuple[gym.spaces.Box, gym.spaces.Box], updates: int
 ) -> dict[str, float]:
-    """Seconds of the high policy's update after one rollout: of sb3-contrib's own, ``stock``, and
-    of ``FastRecurrentPPO``, ``fast``; they take turns, ``updates`` each, and this is the median.
-    ``ratio`` is the median of the turns' ratios, since other work on the machine hits both.
+    """Median time in s of the high policy's update after one rollout, and the median ``ratio``.
 
-    The rollout is noise in which episodes start anywhere, one in ``_EPISODE`` decisions.
+    ``stock`` is the update of sb3-contrib and ``fast`` that of ``FastRecurrentPPO``. They take
+    turns, ``updates`` each. ``ratio`` is the median of the ratios stock / fast of the turns,
+    because other work on the machine affects both.
+
+    The rollout is noise; an episode starts anywhere, at one in ``_EPISODE`` decisions on average.
     """
     ppo, envs = config.ppo, config.n_envs
     learners: dict[str, RecurrentPPO] = {}
@@ -172,7 +175,7 @@ def update_seconds(
     ):
         model = learner(
             policy,
-            None,  # type: ignore[arg-type]  # SB3 loads its files without one, too
+            None,  # type: ignore[arg-type]  # no environment, as when SB3 loads a file
             n_steps=ppo.n_steps,
             batch_size=ppo.n_steps * envs // ppo.minibatches,
             n_epochs=ppo.n_epochs,
@@ -191,7 +194,7 @@ def update_seconds(
         fill(model, np.random.default_rng(0))
         learners[name] = model
     taken: dict[str, list[float]] = {name: [] for name in learners}
-    for _ in range(updates + 1):  # the first one makes the optimiser's state
+    for _ in range(updates + 1):  # the first one, not counted, creates the optimiser's state
         for name, model in learners.items():
             started = time.perf_counter()
             model.train()
@@ -225,7 +228,7 @@ def head(*names: str) -> None:
 
 
 def collected(name: str, workers: int, row: dict[str, float]) -> None:
-    """A line of the table."""
+    """Print a line of the table."""
     share = f"{100 * row['bullet_share']:.0f} %"
     print(
         f"{name:<8}{workers:>11}{row['steps_per_s']:>11.0f}{share:>11}"
@@ -235,7 +238,7 @@ def collected(name: str, workers: int, row: dict[str, float]) -> None:
 
 
 def compare_grounds(robots: int, workers: int, seconds: float) -> dict[str, Any]:
-    """bench.json: ground -> workers, "1" or "all" -> ``measure``."""
+    """Content of bench.json: ground -> workers, "1" or "all" -> ``measure``."""
     families = ("rough", "pillar", "stair", "gap", "tilt")
     result: dict[str, dict[str, dict[str, float]]] = {"plane": {}, "terrain": {}}
     head("ground", *_COLUMNS)
@@ -249,8 +252,11 @@ def compare_grounds(robots: int, workers: int, seconds: float) -> dict[str, Any]
 
 
 def compare_loads(seconds: float) -> dict[str, Any]:
-    """load.json: "collect": robots -> workers -> ``measure``, "learn": threads -> ``learn``, and
-    the usable "cores"."""
+    """Content of load.json.
+
+    "collect" maps robots -> workers -> ``measure``, "learn" maps threads -> ``learn``, and "cores"
+    is the number of usable cores.
+    """
     collect: dict[str, dict[str, dict[str, float]]] = {}
     head("robots", *_COLUMNS)
     for robots in LOAD_ROBOTS:
@@ -268,7 +274,7 @@ def compare_loads(seconds: float) -> dict[str, Any]:
 
 
 def compare_updates(updates: int) -> dict[str, float]:
-    """update.json: ``update_seconds`` on the default configuration."""
+    """Content of update.json: ``update_seconds`` on the default configuration."""
     config = HighTrainConfig()
     result = update_seconds(config, high_spaces(config.env), updates)
     head("update", "seconds", "ratio")
@@ -278,10 +284,12 @@ def compare_updates(updates: int) -> dict[str, float]:
 
 
 def compare_places(robots: int, workers: int, seconds: float) -> dict[str, Any]:
-    """cluster.json: "machine" and "cluster" -> steps_per_s and ms_per_step, and the "overhead" of
-    the cluster as a share of the machine's time a step; "robots" and "workers" of both.
+    """Content of cluster.json: the throughput of local processes and of Ray actors.
 
-    Both take turns, so that other work on the machine hits both.
+    "machine" and "cluster" each map to steps_per_s and ms_per_step. "overhead" is the cluster's
+    extra time per step as a share of the machine's. "robots" and "workers" are the same for both.
+
+    The two take turns, so that other work on the machine affects both.
     """
     links: dict[str, MakeLink] = {"machine": ProcessLink, "cluster": ActorLink}
     config = LowLevelConfig()
@@ -309,10 +317,10 @@ def compare_places(robots: int, workers: int, seconds: float) -> dict[str, Any]:
 
 
 def choose_workers(args: argparse.Namespace) -> int:
-    """As many as ``--workers`` says, on this machine or in the cluster, which is joined.
+    """The number of workers that ``--workers`` asks for, after joining the cluster if one is given.
 
     Raises:
-        InputError: a number that is not allowed, or a cluster that cannot be used.
+        InputError: the number is not allowed, or the cluster cannot be used.
     """
     cores = usable_cores() if args.cluster is None else connect(args.cluster)
     workers: int = args.workers
@@ -373,7 +381,7 @@ def main(arguments: list[str] | None = None) -> int:
             name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
         (args.out / name).write_text(json.dumps(result, indent=2), encoding="utf-8")
     except (WorkerError, OSError) as error:
-        lines = str(error).splitlines()  # a worker's traceback is between the first and the last
+        lines = str(error).splitlines()  # a worker's traceback is between the first and last
         said = " ".join(dict.fromkeys((lines[0], lines[-1])))
         print(f"tdgc.bench: {said}", file=sys.stderr)
         return 1

@@ -1,12 +1,13 @@
-"""Calibration: a copy of a low policy that walks as fast as it is told to.
+"""Calibration: make a copy of a low policy that walks at the velocities it is commanded.
 
     python -m tdgc.calibration --low runs/low/policy --out runs/low/calibrated
 
-A blind policy that learned with random dynamics, pushes and penalties is slower than it is asked to
-be, in each gait differently, but repeatably: on the nominal robot the mean velocity at a command is
-the same to a centimetre a second. So robots walk with commands of all kinds, a network learns which
-velocity each of them leads to, and a copy of the policy learns, in the training MDP, to do at each
-command what the policy does at the command that leads there. What goes in and out of it stays.
+A blind policy trained with random dynamics, pushes and penalties is slower than commanded. The
+error differs between gaits but is repeatable: on the nominal robot the mean velocity at a command
+is reproduced to 1 cm/s. So robots walk with commands of all kinds, and networks learn which
+velocity each command leads to. A copy of the policy then learns, in the training MDP, to do at each
+command what the original does at the command that leads to it. Observations and actions stay the
+same.
 """
 
 import argparse
@@ -39,30 +40,31 @@ from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import is_fallen
 
-#: From the commands asked for to those given, (n, 15) -> (n, 15).
+#: Maps the commands asked for to the commands to give instead, (n, 15) -> (n, 15).
 Correction = Callable[[Array], Array]
 
-_STREAM = 3  # of random numbers, apart from those of training and evaluation (``tdgc.sim.terrain``)
-_BATCH = 400  # robots that walk at a time
+_STREAM = 3  # of random numbers; training and evaluation have others (``tdgc.sim.terrain``)
+_BATCH = 400  # robots that walk at the same time
 _WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2  # the mean is over the rest
-# Of the velocity ranges, in which responses are measured and to which commands may be corrected:
-# further out the policy was never trained, and what it does there is of little use.
+# Factors on the velocity ranges: responses are measured within the first, commands are corrected up
+# to the second. The policy was never trained outside the ranges, and what it does far outside is of
+# little use.
 _MEASURED, _CORRECTED = 1.4, 1.2
-# Share by which a corrected command is pulled back to what was asked: where the robot cannot go
+# Weight of the squared change of a command in the corrector's loss: where the robot cannot go
 # faster, asking for more must not pay.
 _PULL = 0.1
-# With one network instead of three, pace became worse: what it made of commands that lead nowhere
-# was its fancy, and there was nothing to tell so.
+# With one network instead of three, pace became worse: for commands that robots cannot follow its
+# predictions were arbitrary, and nothing revealed it. The variance of three networks does.
 _NETWORKS, _HIDDEN, _EPOCHS, _MINIBATCH = 3, (128, 64), 300, 256
-_CORRECTIONS = 3000  # minibatches that the corrector learns from
+_CORRECTIONS = 3000  # minibatches that the corrector is trained on
 _ROBOTS = 120  # in distillation, as in training
 _TURN = 60  # control steps between updates
-_KEPT = 40  # turns whose states are learned from
-_UPDATES, _STATES = 120, 1024  # minibatches a turn, and their size
-_RATE = 3e-4  # of Adam, falling to nothing
-_WALKING, _FITTED = 0.3, 0.4  # about the shares of the time that are over after walking and fitting
+_KEPT = 40  # latest turns whose states are learned from
+_UPDATES, _STATES = 120, 1024  # minibatches per turn, and their size
+_RATE = 3e-4  # learning rate of Adam, falling to zero
+_WALKING, _FITTED = 0.3, 0.4  # approximate progress after walking and after fitting
 
-_SIGN = np.where(np.isin(NAMES, SIDEWAYS), -1.0, 1.0)  # of commands in a left-right mirror
+_SIGN = np.where(np.isin(NAMES, SIDEWAYS), -1.0, 1.0)  # of commands under left-right mirroring
 
 
 # ------------------------------------------------------------------ what a command leads to
@@ -71,7 +73,7 @@ _SIGN = np.where(np.isin(NAMES, SIDEWAYS), -1.0, 1.0)  # of commands in a left-r
 def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     """Commands given to ``robots`` on a plane and their mean velocities, (n, 15) and (n, 3).
 
-    Velocities are of the heading frame. A robot that fell is left out, so n may be less.
+    Velocities are in the heading frame. Robots that fell are left out, so n may be smaller.
     """
     config = load_low(low)[1]
     rng = np.random.default_rng((_STREAM, seed))
@@ -91,7 +93,7 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
 
 
 def _network(seed: int) -> nn.Sequential:
-    """From commands, scaled as ``ResponseModel.scaled`` does, to three scaled velocities."""
+    """Network from commands, as ``ResponseModel.scaled`` gives them, to scaled velocity offsets."""
     sizes = (NUM_COMMANDS, *_HIDDEN)
     with th.random.fork_rng():
         th.manual_seed(seed)
@@ -102,11 +104,11 @@ def _network(seed: int) -> nn.Sequential:
 
 
 class ResponseModel:
-    """Networks that predict the mean velocity at a command, each with an opinion of its own.
+    """An ensemble of networks, each of which predicts the mean velocity at a command.
 
     Attributes:
-        error: root mean square of their mean on an eighth of the measurements that they have not
-            seen, (3,) in m/s, m/s and rad/s.
+        error: root mean square error of their mean on a held-out eighth of the measurements, (3,)
+            in m/s, m/s and rad/s.
     """
 
     def __init__(self, given: Array, reached: Array, ranges: CommandRanges, seed: int) -> None:
@@ -119,26 +121,26 @@ class ResponseModel:
         self.error = self._fit(given, reached, np.random.default_rng(seed))
 
     def scaled(self, command: Array) -> th.Tensor:
-        """Commands (n, 15) as the networks see them: most within [-1, 1]."""
+        """Commands (n, 15) in the units of the networks: most are within [-1, 1]."""
         return th.from_numpy(((command - self._zero) / self._unit).astype(np.float32))
 
     def velocities(self, scaled: th.Tensor) -> Array:
-        """m/s, m/s, rad/s of the first three of ``scaled`` (n, 3 or more)."""
+        """The first three columns of ``scaled`` (n, 3 or more) in m/s, m/s, rad/s, (n, 3)."""
         return self._unit[:3] * scaled[:, :3].double().numpy() + self._zero[:3]
 
     def predictions(self, x: th.Tensor) -> th.Tensor:
-        """Scaled velocity that each network expects at scaled commands, (networks, n, 3)."""
+        """Scaled velocities that each network predicts at scaled commands, (networks, n, 3)."""
         return th.stack([x[:, :3] + network(x) for network in self._networks])
 
     def __call__(self, command: Array) -> Array:
-        """Velocity at commands (n, 15), the mean of what the networks expect, (n, 3)."""
+        """Velocities at commands (n, 15), the mean of the networks' predictions, (n, 3)."""
         with th.inference_mode():
             return self.velocities(self.predictions(self.scaled(command)).mean(dim=0))
 
     @policies.one_thread()
     def _fit(self, given: Array, reached: Array, rng: np.random.Generator) -> Array:
         held = np.arange(len(given)) % 8 == 0
-        # A robot's mirror image does the mirror image of what it does.
+        # A mirrored robot responds to the mirrored command with the mirrored velocity.
         sign = np.array([np.ones(NUM_COMMANDS), _SIGN])[:, None]
         command = (sign * given[~held]).reshape(-1, NUM_COMMANDS)
         lack = (sign[..., :3] * (reached - given[:, :3])[~held]).reshape(-1, 3) / self._unit[:3]
@@ -149,7 +151,7 @@ class ResponseModel:
             for _ in range(_EPOCHS):
                 order = th.from_numpy(rng.permutation(len(x)))
                 for rows in th.split(order, _MINIBATCH):
-                    # Less of the few that stumble than squares would make.
+                    # Gives the few robots that stumble less weight than a squared loss would.
                     loss = nn.functional.smooth_l1_loss(network(x[rows]), y[rows], beta=0.2)
                     optimiser.zero_grad()
                     loss.backward()  # type: ignore[no-untyped-call]
@@ -159,10 +161,10 @@ class ResponseModel:
 
 
 class Corrector:
-    """Commands with velocities that lead to those asked for, as far as that goes.
+    """Corrects commands so that the robot moves at the velocities asked for, as far as possible.
 
-    A network that is trained through those of the response: to make their mean what was asked, to
-    stay where they agree, and not to ask for more where more does not help.
+    A network trained through the networks of the response: to make their mean what was asked, to
+    keep to commands where they agree, and not to ask for more where more does not help.
     """
 
     @policies.one_thread()
@@ -186,7 +188,7 @@ class Corrector:
             rate.step()
 
     def __call__(self, command: Array) -> Array:
-        """(n, 15) -> (n, 15): other velocities, the rest as it was."""
+        """(n, 15) -> (n, 15): changes the velocities only."""
         corrected = command.copy()
         with th.inference_mode():
             given = self._correct(self._response.scaled(command))
@@ -195,7 +197,8 @@ class Corrector:
 
     def _correct(self, asked: th.Tensor) -> th.Tensor:
         velocity = asked[:, :3] + self._network(asked)
-        # Commands outside the ranges, as those on the way over a tile are not, stay possible.
+        # Commands outside the ranges remain possible, although those on the way over a tile are
+        # within them.
         limit = asked[:, :3].abs().clamp(min=_CORRECTED)
         return th.cat([velocity.clamp(-limit, limit), asked[:, 3:]], dim=1)
 
@@ -204,7 +207,7 @@ class Corrector:
 
 
 def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> list[LowLevelTask]:
-    """The training MDP as it is late in a run: all commands, all levels, most robots on a plane."""
+    """The training MDP as late in a run: all commands, all levels, most robots on a plane."""
     config = dataclasses.replace(config, command_start=1.0)
     on_plane = round(LowTrainConfig().plane_share * robots)
     seeds = np.random.SeedSequence(seed).generate_state(2).tolist()
@@ -218,8 +221,10 @@ def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> list[LowLe
 def shown(
     low: Policy, correct: Correction, task: LowLevelTask
 ) -> tuple[NDArray[np.float32], Array]:
-    """What the actor sees of a task's robots, (M, n), and the actions at which their joint targets
-    are those of ``low`` at corrected commands, (M, 12)."""
+    """Observations of a task's robots, (M, n), and the actions to learn for them, (M, 12).
+
+    With these actions the joint targets are those of ``low`` at the corrected commands.
+    """
     loco = task.locomotion
     x = task.observe()[:, : low.actor_dim]
     asked, pose = loco.command, loco.pose()
@@ -244,13 +249,14 @@ def distil(
     seed: int,
     tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Actor, float, float]:
-    """A student, a copy at first, that learns to do what ``low`` does at corrected commands.
+    """Train a student, at first a copy of ``low``, to act as ``low`` does at corrected commands.
 
-    It acts and learns from the states that it comes to (DAgger, Ross et al. 2011).
+    The student acts, and learns from the states that it visits (DAgger, Ross et al. 2011).
 
     Returns:
-        The student, and the root mean square of its difference in actions: on the states of its
-        first turn before it has learned anything, and on those of its last.
+        The student, and the root mean square of its difference in actions on the states of its
+        first turn, before it has learned anything, and on those of its last, before that turn's
+        updates.
     """
     student = copy.deepcopy(low.actor).requires_grad_(True)
     rng = np.random.default_rng((_STREAM, seed))
@@ -300,17 +306,17 @@ def calibrate(
     seed: int,
     tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Actor, dict[str, float]]:
-    """Measure, fit and distil.
+    """Measure responses, fit the networks and distil the copy.
 
     Args:
-        low: the policy.
-        calibration: how thoroughly.
-        workers: processes that robots walk in.
+        low: the policy to calibrate.
+        calibration: numbers of robots and turns.
+        workers: processes in which the robots walk.
         seed: of everything random here.
-        tick: told now and then which share of the work is done; what it raises ends the work.
+        tick: called now and then with the share of the work done; what it raises ends the work.
 
     Returns:
-        The student, and what is to be known of it (keys say the unit).
+        The student, and facts about its calibration, whose keys include the units.
 
     Raises:
         WorkerError: a worker failed.

@@ -1,9 +1,10 @@
-"""Why a deployed pair failed, from a log of its inputs and outputs.
+"""Diagnose why a deployed pair failed, from a log of its inputs and outputs.
 
     python -m tdgc.diagnose run.npz --export runs/export --outcome fell
 
-Prints the diagnosis and writes the trace. What only a simulator knows is missing in both, and they
-say what it is.
+Prints the diagnosis, writes it and the trace to the results folder, and reports whether the joint
+targets in the log are those of the graphs. What only a simulator knows is null in the trace, and
+the diagnosis lists what was unknown.
 """
 
 import argparse

@@ -1,13 +1,13 @@
-"""What all errors about something that was read have in common: their message is one line."""
+"""Errors about unusable input, with one-line messages, and a check for optional packages."""
 
 import importlib.util
 
 
 class InputError(ValueError):
-    """Something that was read and cannot be used.
+    """Input that was read but cannot be used.
 
-    Messages quote keys, values and file names, which may hold anything: what cannot be printed is
-    escaped, so that a message is always one line.
+    Messages quote keys, values and file names, which may contain anything. Unprintable characters
+    are escaped, so a message is always one line.
     """
 
     def __init__(self, message: str) -> None:
@@ -15,10 +15,10 @@ class InputError(ValueError):
 
 
 def require(what: str, packages: tuple[str, ...], extra: str) -> None:
-    """Refuse to do ``what`` without the packages of an optional extra that it needs.
+    """Check that the ``packages`` of an optional extra that ``what`` needs are installed.
 
     Raises:
-        InputError: names those that are missing and what to install.
+        InputError: a package is missing; names the missing ones and what to install.
     """
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:

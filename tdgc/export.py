@@ -1,13 +1,13 @@
-"""Both policies as ONNX and TorchScript graphs, for a robot that has no part of this package.
+"""Export both policies as ONNX and TorchScript graphs, for a robot without this package.
 
     python -m tdgc.export --low runs/low/policy --high runs/high/policy --out runs/export
 
-A graph holds all that stands between a robot's sensors and its joint targets: observation
-(Sec. IV-A, IV-B), network, decoder, phase clock and joint targets. Beside ``low.onnx`` and
-``low.pt`` stands ``low_interface.json``, which says what goes in and comes out, in which order and
-unit, and how the joints are driven; likewise for ``high``, with the task. The robot's URDF is there
-too. Afterwards each pair of graphs drives a robot in the simulator for as long as an episode, from
-the folder alone (``tdgc.deploy``), and its outputs are compared with the policies'.
+A graph holds everything between a robot's sensors and its joint targets: observation (Sec. IV-A,
+IV-B), network, decoder, phase clock and joint targets. Next to ``low.onnx`` and ``low.pt``,
+``low_interface.json`` describes the inputs and outputs with their order and units, and how the
+joints are driven; likewise for ``high``, with the task. The robot's URDF is copied there too. After
+writing, each pair of graphs drives a robot in the simulator for the length of an episode, from the
+folder alone (``tdgc.deploy``), and its outputs are compared with those of the policies.
 """
 
 import argparse
@@ -48,12 +48,12 @@ from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.rules import GOAL_RADIUS, GOING, outcome
 
 #: Largest difference allowed between graphs and policies, in the units of the outputs: float32
-#: networks of this size differ by about 1e-6 where two libraries add up in another order.
+#: networks of this size differ by about 1e-6 when two libraries sum in a different order.
 TOLERANCE = 1e-5
 
-# The extra `export` of setup.cfg; all but the first are for the format onnx.
+# The extra `export` of setup.cfg; all but the first are only needed for the format onnx.
 _PACKAGES = ("jsonschema", "onnx", "onnxruntime", "onnxscript")
-_CHECKED_ON = "rough"  # where every step differs from the one before
+_CHECKED_ON = "rough"  # a family on which every step differs from the previous one
 
 
 # ---------------------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ _CHECKED_ON = "rough"  # where every step differs from the one before
 
 @dataclass(frozen=True)
 class Pair:
-    """Both policies and the MDPs that they were trained on."""
+    """Both policies and the MDPs they were trained on."""
 
     low: Policy
     low_config: LowLevelConfig
@@ -71,10 +71,10 @@ class Pair:
 
 
 def load_pair(low: str | Path, high: str | Path) -> Pair:
-    """Both policies from their files.
+    """Load both policies from their files.
 
     Raises:
-        ValueError: a file that cannot be used, or policies that do not fit each other.
+        ValueError: a file cannot be used, or the policies do not fit each other.
     """
     low_policy, low_config = load_low(low)
     size = width(actor_layout(low_config.robot, low_config.gyro))
@@ -89,8 +89,10 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
 
 
 def interfaces(pair: Pair, low: LowGraph, high: HighGraph) -> dict[str, Table]:
-    """What the two interface files say, by graph, but for the graphs' files; ``tdgc.deploy`` has
-    their schema."""
+    """Contents of the two interface files by graph, except ``files``.
+
+    Their schema is ``tdgc/deploy/interface.schema.json``.
+    """
     config, task = pair.low_config, pair.high_config
     robot, physics = config.robot, config.physics
     geometry, urdf = read_geometry(robot), urdf_path(robot)
@@ -171,7 +173,7 @@ def _quantity(unit: str, value: Any) -> Table:
 
 
 def _head(name: str, policy: Policy, graph: LowGraph | HighGraph, rate: float) -> Table:
-    """What both interface files begin with."""
+    """Fields that both interface files begin with."""
 
     def table(signal: Signal) -> Table:
         said = dataclasses.asdict(signal)
@@ -191,7 +193,7 @@ def _head(name: str, policy: Policy, graph: LowGraph | HighGraph, rate: float) -
 
 
 def _commands(ranges: CommandRanges) -> list[Table]:
-    """Name, unit and bounds of each command, in order; of the embedding its two values."""
+    """Name, unit and bounds of each command, in order; for the embedding, its two values."""
     bounds = CommandDecoder(ranges)
     rows = zip(NAMES, UNITS, bounds.low.tolist(), bounds.high.tolist(), strict=True)
     return [
@@ -202,9 +204,9 @@ def _commands(ranges: CommandRanges) -> list[Table]:
 
 
 def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
-    """Write graphs and interface files of both policies and the URDF into ``folder``, which exists.
+    """Write the graphs and interface files of both policies and the URDF to an existing ``folder``.
 
-    Graphs of other formats, which an earlier export left there, go away.
+    Graphs that an earlier export left there in other formats are deleted.
 
     Raises:
         OSError: a file cannot be written.
@@ -226,12 +228,12 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
 
 
 def _file(path: Path) -> Table:
-    """How an interface file names a file beside it."""
+    """Reference to a file, as it stands in an interface file: name and checksum."""
     return {"file": path.name, "sha256": checksum(path)}
 
 
 def _copy_robot(urdf: Path, folder: Path) -> None:
-    """Copy a URDF, and those of its meshes that lie beside or below it."""
+    """Copy a URDF and those of its meshes that lie in its folder or below."""
     shutil.copyfile(urdf, folder / urdf.name)
     for mesh in ElementTree.parse(urdf).iter("mesh"):
         name = Path(mesh.get("filename", ""))
@@ -265,13 +267,14 @@ def _write_graph(graph: LowGraph | HighGraph, path: Path) -> None:
 
 @dataclass(frozen=True)
 class Check:
-    """What ``check`` found.
+    """Result of ``check``.
 
     Attributes:
-        difference: the largest between an output of a graph and the policy's.
-        seconds: (control steps,) CPU time in the graphs: the low policy's, and every decimation-th
-            step the high policy's too. Between two of them the simulator empties the caches.
-        repeated: (control steps,) the same of the same steps, one right after the other.
+        difference: largest difference between graphs and policies, in decision, commands, action,
+            joint targets, joint torques and start pose.
+        seconds: (control steps,) CPU time in the graphs: the low policy, and in every decimation-th
+            step the high policy too. Between steps the simulator evicts the CPU caches.
+        repeated: (control steps,) CPU time of the same steps, run back to back.
     """
 
     difference: float
@@ -280,20 +283,20 @@ class Check:
 
 
 def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
-    """Let the graphs in ``folder`` drive a robot for as long as an episode, policies beside them.
+    """Let the graphs in ``folder`` drive a robot for the length of an episode next to the policies.
 
-    What drives is read from the folder alone: sensors, probes, task, order and joint control. The
-    policies see the same robot through the simulator's own observation, with their own
-    configurations, clock and LSTM state. A robot that falls, leaves its tile or reaches its goal
-    starts again.
+    Everything that drives the robot is read from the folder alone: sensors, probes, task, order and
+    joint control. The policies see the same robot through the simulator's own observation, with
+    their own configurations, clock and LSTM state. A robot that falls, collides, leaves its tile or
+    reaches its goal starts again.
 
     Args:
-        folder: where ``write`` wrote.
-        form: of ``FORMATS``.
+        folder: folder that ``write`` wrote to.
+        form: one of ``FORMATS``.
         low, high: the policies' paths.
 
     Raises:
-        ValueError: policies or a folder that cannot be used.
+        ValueError: the policies or the folder cannot be used.
     """
     pair, controller = load_pair(low, high), Controller(folder, form)
     config, limit = pair.low_config, pair.low_config.robot.action_limit
@@ -356,7 +359,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
 
 
 def _report(form: str, result: Check) -> bool:
-    """Say what was found; whether graphs and policies differ by no more than is allowed."""
+    """Print the result; return whether the difference is within ``TOLERANCE``."""
     (median, slow), (again, slow_again) = (
         1e3 * np.percentile(times, [50.0, 99.0]) for times in (result.seconds, result.repeated)
     )
@@ -400,7 +403,7 @@ def main(arguments: list[str] | None = None) -> int:
         pair = load_pair(args.low, args.high)
         args.out.mkdir(parents=True, exist_ok=True)
         write(pair, args.out, formats)
-        th.set_num_threads(1)  # the time of one core is asked for
+        th.set_num_threads(1)  # times are reported for one core
         good = [_report(form, check(args.out, form, args.low, args.high)) for form in formats]
     except (ValueError, OSError) as error:
         print(f"tdgc.export: {error}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, checksums, and folders that can be written to."""
+"""Atomic file writes, checksums, and writable folders."""
 
 import contextlib
 import hashlib
@@ -10,8 +10,10 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """A place beside ``path`` to write to: what is there in the end takes the place of ``path``,
-    unless something was raised, which leaves ``path`` as it was."""
+    """Yield a temporary path next to ``path`` to write to.
+
+    On success the file written there replaces ``path``; on an exception ``path`` stays as it was.
+    """
     partial = path.parent / f".{path.name}.{os.getpid()}.tmp"
     try:
         yield partial
@@ -21,10 +23,10 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and see that it can be written to: rather now than after the work.
+    """Make a folder and check that it is writable, so that a failure comes before the work.
 
     Raises:
-        OSError: it cannot.
+        OSError: the folder cannot be made or written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=folder).close()
@@ -34,6 +36,6 @@ def checksum(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -2,9 +2,9 @@
 
     python -m tdgc.mujoco --export runs/export --levels 6-10 --families all --episodes 20
 
-What drives the robot is read from the exported folder alone: ONNX graphs, interface files and URDF.
-Tiles, rules, tables and files are those of evaluate.py; physics is MuJoCo's, docs/mujoco.md has its
-settings. It needs the extra ``mujoco``.
+Everything that drives the robot is read from the exported folder alone: ONNX graphs, interface
+files and URDF. Tiles, rules, tables and files are those of evaluate.py. The physics is MuJoCo's;
+docs/mujoco.md lists its settings. It needs the extra ``mujoco``.
 """
 
 import argparse
@@ -44,11 +44,11 @@ _PACKAGES = ("jsonschema", "mujoco", "onnxruntime")  # the extra `mujoco` of set
 
 
 class Deployed(Driver):
-    """An exported pair in the closed loop with one simulated robot: driver and executor at once.
+    """An exported pair in the closed loop with one simulated robot, as both driver and executor.
 
     Args:
-        controller: of the exported folder.
-        log: that its steps are written to.
+        controller: controller of the exported folder.
+        log: log to write the steps to; None for no log.
     """
 
     def __init__(self, controller: Controller, log: LogWriter | None = None) -> None:
@@ -64,7 +64,7 @@ class Deployed(Driver):
         self.controller.reset(float(loco.clock.clock[0]))
 
     def readings(self) -> dict[str, Array]:
-        """What the robot's sensors and map say now."""
+        """The robot's current sensor and map readings."""
         world = self._loco.world
         return self.controller.sense(world.state, self._goal, self._family, world.ground_height)
 
@@ -80,7 +80,7 @@ class Deployed(Driver):
         return self.controller.commands[None]
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
-        """Carry out the joint targets of the step that ``command`` ran."""
+        """Apply the joint targets of the step that ``command`` ran."""
         loco, low = self._loco, self.controller.low.values
         loco.command[:], loco.carried_out = commands, commands.copy()
         went = np.mod(low["next_clock"] - low["clock"], 1.0)
@@ -93,7 +93,7 @@ class Deployed(Driver):
 
 @functools.lru_cache(maxsize=1)
 def load(export: Path) -> Controller:
-    """The pair in an exported folder, once per process."""
+    """Load the pair in an exported folder, once per process."""
     return Controller(export)
 
 
@@ -108,15 +108,15 @@ def run_episode(
     """Run the only episode of ``cell``.
 
     Args:
-        cell: which one.
-        pair: what drives the robot.
+        cell: a cell with one episode.
+        pair: the exported pair, which drives the robot.
         config: MuJoCo's settings.
-        seed: of the evaluation's tiles.
-        watchers: who look on.
-        visual: keep what only a window shows.
+        seed: seed of the evaluation's tiles.
+        watchers: observers that are called at every control step.
+        visual: keep the visual shapes, which only a window shows.
 
     Raises:
-        ValueError: a robot or settings that cannot be used.
+        ValueError: the robot or the settings cannot be used.
     """
     from tdgc.sim.mujoco_world import MujocoWorld
 
@@ -145,8 +145,10 @@ def run_cell(
     logs: Path,
     logged: int,
 ) -> tuple[list[Episode], list[Recording]]:
-    """Run the episodes of a cell one after another; recordings of the first ``filmed``, and logs
-    of the first ``logged`` written into ``logs``."""
+    """Run the episodes of a cell one after another.
+
+    Records the first ``filmed`` episodes and writes logs of the first ``logged`` into ``logs``.
+    """
     controller, episodes, recordings = load(export), [], list[Recording]()
     for number in range(cell.first, cell.first + cell.count):
         one = Cell(cell.policy, cell.condition, cell.family, cell.level, number, 1)
@@ -161,7 +163,7 @@ def run_cell(
 
 
 def make_room(args: argparse.Namespace) -> None:
-    """Make the results folder; what an earlier table left goes away."""
+    """Make the results folder and delete the files of an earlier run in it."""
     args.out.mkdir(parents=True, exist_ok=True)
     for pattern in ("logs/*.npz", "films/*", "settings.json", *FILES):
         for old in args.out.glob(pattern):
@@ -172,10 +174,10 @@ def make_room(args: argparse.Namespace) -> None:
 
 
 def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
-    """Run all cells and write everything; what is missing, a line each.
+    """Run all cells and write all results; return problems with the films, one line each.
 
     Raises:
-        Exception: one of ``STOPS``; the table of what is complete is written.
+        Exception: one of ``STOPS`` occurred; the table of the complete cells is still written.
     """
     settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
     (args.out / "settings.json").write_text(json.dumps(settings, indent=2), encoding="utf-8")
@@ -209,7 +211,7 @@ def show(args: argparse.Namespace, config: "MujocoConfig") -> None:
     """Show the first episode of the first family and level in MuJoCo's viewer.
 
     Raises:
-        WindowError: no display, or the window was closed.
+        WindowError: there is no display, or the window was closed.
     """
     from tdgc.sim.mujoco_world import Window
 
@@ -258,10 +260,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def check(args: argparse.Namespace) -> "MujocoConfig":
-    """Read what the flags ask for; MuJoCo's settings.
+    """Check the flags and the exported folder; return MuJoCo's settings.
 
     Raises:
-        ValueError: flags or an exported folder that cannot be used.
+        ValueError: the flags or the exported folder cannot be used.
     """
     require("MuJoCo's benchmark", _PACKAGES, "mujoco")
     from tdgc.sim.mujoco_world import MujocoConfig
@@ -300,7 +302,7 @@ def main(arguments: list[str] | None = None) -> int:
             show(args, config)
         else:
             problems = run_table(args, config)
-    except (ValueError, WindowError) as error:  # MuJoCo cannot load the robot, or has no window
+    except (ValueError, WindowError) as error:  # MuJoCo cannot load the robot or open a window
         fail(error)
         return 2
     except STOPS as error:

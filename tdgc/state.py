@@ -1,7 +1,7 @@
-"""States to go on from: nested dicts of arrays and of what JSON can hold.
+"""States to resume from: nested dicts of arrays and JSON values.
 
-What has a state gives copies of its arrays, and takes them back in place with ``fill``. A
-checkpoint keeps the arrays and the rest in two files, see ``split`` and ``join``.
+An object with a state returns copies of its arrays, and restores them in place with ``fill``. A
+checkpoint stores the arrays and the rest in two files, see ``split`` and ``join``.
 """
 
 from collections.abc import Mapping
@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 State = dict[str, Any]
-_PLACE = "array"  # the only key of what stands where ``split`` took an array out
+_PLACE = "array"  # the only key of the dict that ``split`` leaves in place of an array
 
 
 def fill(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> None:
     """Copy the values of ``state`` into the arrays of the same names, in place.
 
     Raises:
-        ValueError: a name that the state lacks, or another shape.
+        ValueError: the state lacks a name, or a value has another shape.
     """
     for name, array in arrays.items():
         if name not in state:
@@ -30,12 +30,12 @@ def fill(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> None:
 
 
 def copies(arrays: Mapping[str, NDArray[Any]]) -> State:
-    """The same names with copies of the arrays."""
+    """A state with copies of the arrays, under the same names."""
     return {name: array.copy() for name, array in arrays.items()}
 
 
 def split(tree: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
-    """``tree`` with its arrays moved to ``arrays``, named by their place under ``path``."""
+    """Return ``tree`` with its arrays moved to ``arrays``, named by their place under ``path``."""
     if isinstance(tree, np.ndarray):
         arrays[path] = tree
         return {_PLACE: path}
@@ -47,10 +47,10 @@ def split(tree: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
 
 
 def join(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    """What ``split`` took apart.
+    """Undo ``split``: put the ``arrays`` back into ``tree``.
 
     Raises:
-        KeyError: an array that is missing.
+        KeyError: an array is missing.
     """
     if isinstance(tree, dict):
         if tree.keys() == {_PLACE}:

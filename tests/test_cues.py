@@ -15,7 +15,7 @@ from tdgc.config import HighLevelConfig
 from tdgc.sim.commands import INDEX
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, START_X
-from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.leaps import Landing, LeapPlan, Motion, measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES
 
@@ -131,6 +131,22 @@ def test_lips_are_where_probes_met_them(
     found = [law.memory.profile.trenches(i, max(track[i], 0), 0.3)[0, 0] for i in range(4)]
     there = [tile_of(11, "gap", 4, i).features.trenches[0, 0] for i in range(4)]
     np.testing.assert_allclose(found, there, atol=0.06)
+
+
+def test_leaps_are_timed_by_the_gait_clock(law: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cue has its phases warped by the duty factor: by 0.05 of a cycle in leaps, 2 cm."""
+    driver = HierarchyDriver(law, HighLevelConfig(commands=CONFIG.commands))
+    off, plan_steps = [], LeapPlan.steps
+
+    def steps(plan: LeapPlan, rows: Array, motion: Motion, landing: Landing) -> tuple[Array, Array]:
+        off.extend(wrap_angle(2.0 * np.pi * (motion.clock - driver._loco.clock.clock[rows])))
+        return plan_steps(plan, rows, motion, landing)
+
+    monkeypatch.setattr(LeapPlan, "steps", steps)
+    monkeypatch.setattr(evaluation, "HORIZON", 1.5)
+    run_cell(Cell("cues", "nominal", "gap", 4, 0, 2), LOW, driver, seed=11)
+    assert len(off) > 20
+    np.testing.assert_allclose(off, 0.0, atol=1e-5)
 
 
 def test_the_slope_is_seen_by_the_probes_at_either_side(

@@ -14,6 +14,7 @@ from tdgc.sim.gaits import (
     foot_phases,
     gait_embedding,
     normal_cdf,
+    raw_phase,
     swing_profile,
 )
 
@@ -67,6 +68,14 @@ def test_the_three_terms_one_by_one() -> None:
     """Values no gait has, so that a term that goes to the wrong foot shows."""
     phases = foot_phases(np.array([0.05]), np.array([[0.1, 0.2, 0.3]]), np.array([0.5]))
     np.testing.assert_allclose(phases, [[0.65, 0.25, 0.35, 0.15]], atol=1e-12)
+
+
+@pytest.mark.parametrize("duty", [0.4, 0.5, 0.6])
+def test_the_clock_follows_from_a_warped_phase(duty: float) -> None:
+    clock, duties = np.linspace(0.0, 0.99, 100), np.full(100, duty)
+    front_right = foot_phases(clock, np.tile(gait_embedding(1), (100, 1)), duties)[:, 1]
+    np.testing.assert_allclose(raw_phase(front_right, duties), clock, atol=1e-12)
+    assert np.abs(front_right - clock).max() == pytest.approx(abs(duty - 0.5), abs=0.01)
 
 
 @pytest.mark.parametrize("duty", [0.4, 0.5, 0.6])

@@ -1,1 +1,1 @@
-"""The ablation: variants of the hierarchy, their trials, the table."""
+"""Ablation study: variants of the hierarchy, their trials and the table of results."""

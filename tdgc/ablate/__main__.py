@@ -1,15 +1,16 @@
-"""The ablation: what each part of the hierarchy is worth, on the same tiles, at the same budget.
+"""Ablation: measure what each part of the hierarchy contributes, on the same tiles and budget.
 
     python -m tdgc.ablate --out runs/ablation
     python -m tdgc.ablate --out runs/ablation --only full,trot --seeds 42,43
     python -m tdgc.ablate --out runs/alone --no-teacher
 
-Each variant is a list of settings, trained by train_high.py from scratch and evaluated by
-evaluate.py; some are evaluated only, with the policy of ``full``. Stopped or killed at any moment,
-the same command goes on where it was, within a training too. A trial that fails is named with its
-error, and the others are kept. Writes ``ablation.json``, ``ablation.txt`` and ``ablation.png``.
+Each variant is a list of settings, trained from scratch by train_high.py and evaluated by
+evaluate.py. Some variants are only evaluated, with the policy of ``full`` or with a scripted one.
+If the command is stopped or killed at any moment, the same command continues where it was, also
+within a training. A trial that fails is reported with its error, and the others are kept. The
+results are ``ablation.json``, ``ablation.txt`` and ``ablation.png``.
 
-It is run where the scripts are, in the root of the repository.
+Run it in the root of the repository, where the scripts are.
 """
 
 import argparse
@@ -61,10 +62,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def choose(only: str | None, allowed: Sequence[Variant]) -> list[Variant]:
-    """The variants that ``--only`` names, in the table's order.
+    """The variants named by ``--only``, in the order of the table.
 
     Raises:
-        InputError: a name that is none.
+        InputError: a name is unknown.
     """
     names = [variant.name for variant in allowed]
     wanted = names if only is None else only.split(",")
@@ -75,10 +76,10 @@ def choose(only: str | None, allowed: Sequence[Variant]) -> list[Variant]:
 
 
 def choose_seeds(text: str) -> list[int]:
-    """``42,43`` as numbers.
+    """Parse the seeds of ``--seeds``, such as ``42,43``; duplicates are dropped.
 
     Raises:
-        InputError: something else.
+        InputError: the text is not a list of numbers.
     """
     try:
         return list(dict.fromkeys(int(part) for part in text.split(",")))
@@ -87,7 +88,7 @@ def choose_seeds(text: str) -> list[int]:
 
 
 def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Trial]:
-    """All trials: one seed after the other, and what is not trained, but a script, once."""
+    """All trials, seed by seed; scripted policies have no seed and run once, with the first."""
     return [
         Trial(variant, seed if variant.policy == "tdgc" else None)
         for seed in seeds
@@ -97,10 +98,10 @@ def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Trial]:
 
 
 def claim(runner: Runner) -> dict[str, Any]:
-    """What all trials in the folder have in common, written down by the first call.
+    """What all trials in the folder have in common, recorded there by the first call.
 
     Raises:
-        InputError: the folder holds trials that cannot be compared with these; or a low policy that
+        InputError: the folder holds trials that cannot be compared with these, or the low policy
             cannot be used.
     """
     digest = hashlib.sha256()
@@ -108,7 +109,7 @@ def claim(runner: Runner) -> dict[str, Any]:
         digest.update(name.encode() + tensor.numpy().tobytes())
     common = {
         "low": str(runner.low),
-        "low_sha256": digest.hexdigest(),  # its training may have gone on meanwhile
+        "low_sha256": digest.hexdigest(),  # it may have been trained further meanwhile
         "no_teacher": runner.alone,
         "settings": list(runner.settings),
         "steps": runner.steps,
@@ -139,8 +140,7 @@ def report(
     trials: Sequence[Trial],
     found: Mapping[Trial, Found],
 ) -> str:
-    """Write ablation.json, ablation.txt and ablation.png of what there is by now; returns the
-    text."""
+    """Write ablation.json, ablation.txt and ablation.png of the results so far; return the text."""
     table = rows(tiles, trials, found)
     described = describe(table)
     written = {
@@ -157,11 +157,11 @@ def report(
 def conduct(
     runner: Runner, trials: Sequence[Trial], common: dict[str, Any], tiles: Sequence[Tile]
 ) -> tuple[dict[Trial, Found], bool]:
-    """Run ``trials`` one after the other, with a report after each.
+    """Run ``trials`` one after the other, and write a report after each.
 
     Returns:
-        What those came to that were run, and whether all were: False after a signal or at the time
-        limit.
+        The results of the trials that were run, and whether all were run: False after a signal or
+        at the time limit.
     """
     found: dict[Trial, Found] = {}
     for trial in trials:
@@ -185,7 +185,7 @@ def main(arguments: list[str] | None = None) -> int:
     )  # fmt: skip
     try:
         chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
-        for variant in chosen:  # before hours of training, what would fail after them
+        for variant in chosen:  # invalid settings fail now, not after hours of training
             with_overrides(HighTrainConfig(), runner.training_settings(variant))
         tiles, common = runner.tiles(), claim(runner)
     except (ValueError, OSError) as error:
@@ -195,7 +195,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         found, finished = conduct(runner, trials, common, tiles)
         print(report(args.out, common, tiles, trials, found))
-    except OSError as error:  # what is done is in the trials' folders
+    except OSError as error:  # finished trials stay in their folders
         print(f"tdgc.ablate: {error}", file=sys.stderr)
         return 1
     if not finished:

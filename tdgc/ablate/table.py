@@ -1,7 +1,7 @@
 """The table of an ablation: trials -> rows, and rows as text.
 
-Rates are means over the tiles and over the seeds of a variant. Intervals are those of the tiles,
-with these seeds. How much a seed changes shows in the rates of the seeds alone.
+Rates are means over the tiles and over the seeds of a variant. Intervals cover the choice of tiles
+only, for the given seeds. How much the seed matters shows only in the rates per seed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from tdgc.ablate.trials import Result, Tile, Trial
 from tdgc.ablate.variants import WHOLE
 from tdgc.benchmark.intervals import difference, rates
 
-#: What a trial came to, or the message of its error.
+#: The result of a trial, or its error message.
 Found = Result | str
 
 
@@ -25,15 +25,15 @@ def rows(
     """A row for each variant, over its seeds.
 
     Args:
-        tiles: that each trial was evaluated on.
-        trials: all, in order.
-        found: of those that were run.
+        tiles: those that each trial was evaluated on.
+        trials: all of them, in order.
+        found: results or error messages of the trials that were run.
 
     Returns:
-        Of each variant ``name``, ``what`` and ``errors``, seed -> message. If a trial is done also
-        ``rates`` of its seeds' episodes; ``families`` and ``seeds``, each -> rate; ``versus``:
-        ``difference`` to ``full`` with the same seed; and of a training ``FACTS``, means over the
-        seeds.
+        For each variant, its ``name``, ``what`` and ``errors`` (seed -> message). If a trial is
+        done, also the ``rates`` of all its seeds' episodes; ``families`` and ``seeds``, each ->
+        rate; ``versus``, the ``difference`` from ``full`` with the same seed; and, if it was
+        trained, the means of ``FACTS`` over the seeds.
     """
     of = np.array([family for family, _, _ in tiles])
     done = {trial: result for trial, result in found.items() if isinstance(result, Result)}
@@ -55,7 +55,7 @@ def rows(
                 (result.reached, other)
                 for trial, result in results.items()
                 for seed, other in whole.items()
-                if trial.seed in (seed, None)  # a script has none, and meets all of them
+                if trial.seed in (seed, None)  # a script has no seed and is compared with all
             ]
             row["versus"] = None
             if pairs and variant.name != WHOLE:
@@ -68,7 +68,7 @@ def rows(
 
 
 def describe(table: Sequence[dict[str, Any]]) -> str:
-    """Rows as text, with the errors below them."""
+    """Format rows as text, with the errors below them."""
     families = list(next((row["families"] for row in table if "n" in row), {}))
     wide = max(len(row["name"]) for row in table) + 1
     head = f"{'variant':<{wide}}{'n':>6}{'success':>9}{'95 %':>15}{'against full':>22}"

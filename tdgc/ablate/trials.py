@@ -1,7 +1,7 @@
 """Trials: a variant with a seed, trained by train_high.py and evaluated by evaluate.py.
 
-A trial has a folder: the run of its training, ``evaluation`` with the results of evaluate.py, and
-``cell.json`` once it is done. Until then a trial that is run again goes on where it was.
+A trial's folder holds the files of its training run, ``evaluation`` with the results of
+evaluate.py, and ``cell.json`` once it is done. Until then, running it again continues where it was.
 """
 
 import contextlib
@@ -35,12 +35,12 @@ from tdgc.tasks.rules import OUTCOMES
 
 #: Family, level and number of a tile.
 Tile = tuple[str, int, int]
-#: What is kept of a training: decisions, s, and h of all robots together.
+#: What is kept of a training: decisions, s, and h simulated, summed over all robots.
 FACTS = ("steps", "train_seconds", "simulated_hours")
 
 
 class TrialError(InputError):
-    """A trial that cannot be trained or evaluated; the message is one line."""
+    """A trial cannot be trained or evaluated; the message is one line."""
 
 
 class StoppedError(Exception):
@@ -49,23 +49,23 @@ class StoppedError(Exception):
 
 @dataclass(frozen=True)
 class Trial:
-    """A variant with the seed of its training; None where no training is in it."""
+    """A variant with the seed of the trained policy it uses; None if it is scripted."""
 
     variant: Variant
     seed: int | None
 
     @property
     def name(self) -> str:
-        """Of the trial and of its folder."""
+        """Name of the trial and of its folder."""
         return self.variant.name if self.seed is None else f"{self.variant.name}-{self.seed}"
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a trial came to.
+    """The result of a trial.
 
     Attributes:
-        facts: ``FACTS`` of its training; empty without one.
+        facts: ``FACTS`` of its training; empty if nothing was trained.
         reached: (n,) whether the goal was reached, in the order of ``Runner.tiles``.
     """
 
@@ -75,18 +75,18 @@ class Result:
 
 @dataclass(frozen=True)
 class Runner:
-    """Runs trials that can be compared.
+    """Runs trials that can be compared with each other.
 
     Attributes:
-        out: where their folders are.
-        low: the low policy's path.
+        out: parent of their folders.
+        low: path of the low policy.
         alone: train without a teacher.
-        settings: of all trainings, before the variants' own.
-        steps: decisions of a training; None for train_high.py's own number.
-        levels: as evaluate.py takes them.
-        episodes: of a family and level.
-        workers: as both scripts take them.
-        deadline: on ``time.monotonic``'s clock, s; None for none.
+        settings: applied to all trainings, before those of the variants.
+        steps: decisions per training; None for the default of train_high.py.
+        levels: in the format of evaluate.py.
+        episodes: per family and level.
+        workers: in the format of both scripts.
+        deadline: in s, on the clock of ``time.monotonic``; None for no deadline.
     """
 
     out: Path
@@ -100,11 +100,11 @@ class Runner:
     deadline: float | None
 
     def run(self, trial: Trial) -> Result:
-        """Train a trial, if need be, and evaluate it, from where an earlier call was.
+        """Train a trial, if it needs training, and evaluate it; continue from an earlier call.
 
         Raises:
-            TrialError: it cannot be done, or a file of it is damaged.
-            StoppedError: it is not done yet.
+            TrialError: it failed, or one of its files is damaged.
+            StoppedError: a signal or the deadline came before it was done.
         """
         folder = self.out / trial.name
         try:
@@ -118,14 +118,14 @@ class Runner:
             )
         except StoppedError:
             raise
-        except (InputError, OSError) as error:  # they say which file
+        except (InputError, OSError) as error:  # their messages name the file
             raise TrialError(str(error)) from error
-        except Exception as error:  # whatever it is, the other trials go on
+        except Exception as error:  # whatever happened, the other trials continue
             said = " ".join(str(error).split())
             raise TrialError(f"{type(error).__name__}: {said}") from error
 
     def _complete(self, trial: Trial, folder: Path) -> None:
-        """Do what is left of a trial; in the end it has its ``cell.json``."""
+        """Do the remaining work of a trial and write its ``cell.json``."""
         high = None
         if trial.variant.settings is not None:
             self._train(trial, folder)
@@ -148,22 +148,22 @@ class Runner:
             partial.write_text(json.dumps(found, indent=2), encoding="utf-8")
 
     def tiles(self) -> list[Tile]:
-        """All tiles that each trial is evaluated on.
+        """The tiles that each trial is evaluated on.
 
         Raises:
-            ValueError, OSError: flags that evaluate.py cannot use.
+            ValueError, OSError: evaluate.py cannot use the flags.
         """
         flags = self.evaluation_flags("gp", self.low, None)
         e = evaluate.Evaluation.of(evaluate.parse([str(flag) for flag in flags]))
         return list(itertools.product(e.families, e.levels, range(e.episodes)))
 
     def training_settings(self, variant: Variant) -> tuple[str, ...]:
-        """What ``--set`` is given in a variant's training."""
+        """Values of ``--set`` for a variant's training."""
         own = (variant.settings or ()) + (variant.alone if self.alone else ())
         return self.settings + own
 
     def evaluation_flags(self, policy: str, low: Path, high: Path | None) -> list[object]:
-        """The flags of evaluate.py: of all variants the same tiles."""
+        """Flags of evaluate.py; the tiles are the same for all variants."""
         env = with_overrides(HighTrainConfig(), self.settings).env
         families = dict.fromkeys(name for name in env.families if name not in UNNAMED)
         flags: list[object] = [
@@ -174,12 +174,12 @@ class Runner:
         return flags if high is None else [*flags, "--high", high]
 
     def _train(self, trial: Trial, folder: Path) -> None:
-        """Train to the end of the budget."""
+        """Train until the budget is used up."""
         flags: list[object] = []
         if any((folder / "checkpoints").glob("step-*")):
             flags += ["--resume"]
         else:
-            shutil.rmtree(folder, ignore_errors=True)  # killed before its first checkpoint
+            shutil.rmtree(folder, ignore_errors=True)  # it was killed before its first checkpoint
             flags += ["--low", self.low, "--seed", trial.seed, "--workers", self.workers]
             flags += [] if self.steps is None else ["--steps", self.steps]
             flags += ["--no-teacher"] if self.alone else []
@@ -207,7 +207,7 @@ class Runner:
 
 
 class _Tee(io.StringIO):
-    """Keeps what goes to a stream."""
+    """Passes text on to a stream and keeps a copy."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__()
@@ -225,7 +225,7 @@ def call(main: Callable[[list[str]], int], flags: Sequence[object]) -> None:
     """Call a script's ``main``.
 
     Raises:
-        TrialError: it failed; with what it said.
+        TrialError: it failed; the message is the script's last error line, or else its status.
     """
     said = _Tee(sys.stderr)
     with contextlib.redirect_stderr(said):
@@ -239,7 +239,7 @@ def call(main: Callable[[list[str]], int], flags: Sequence[object]) -> None:
 
 @contextlib.contextmanager
 def _own_signals() -> Iterator[None]:
-    """Give SIGINT and SIGTERM back to who had them: a training takes them over."""
+    """Restore the handlers of SIGINT and SIGTERM afterwards: a training replaces them."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
@@ -254,12 +254,13 @@ def _own_signals() -> Iterator[None]:
 def changed_pair(
     variant: Variant, low: Path, high: Path | None, folder: Path
 ) -> tuple[Path, Path | None]:
-    """The policies that a variant is evaluated with. Copies with a changed configuration are
-    written into ``folder``.
+    """The low and high policy that a variant is evaluated with.
+
+    Copies with a changed configuration are written into ``folder``.
 
     Raises:
-        ValueError: a policy that is missing or cannot be used.
-        OSError: copies that cannot be written.
+        ValueError: a policy is missing or cannot be used.
+        OSError: a copy cannot be written.
     """
     if variant.low == "uncalibrated":
         low = low.with_name("uncalibrated")  # where train_low.py leaves it
@@ -273,14 +274,14 @@ def changed_pair(
 
 
 def _copy(source: Path, target: Path, changes: dict[str, Any]) -> Path:
-    """Write a policy with changes to its ``meta``."""
+    """Write a copy of a policy with changes to its ``meta``."""
     policy = policies.load(source)
     policies.save_copy(target, policy, {}, _changed(policy.meta, changes))
     return target
 
 
 def _changed(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """A nested table with some of its values changed."""
+    """A copy of a nested table with some of its values changed."""
     return table | {
         key: _changed(table[key], value) if isinstance(value, dict) else value
         for key, value in changes.items()
@@ -291,10 +292,10 @@ def _changed(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _number(table: Any, key: str, path: Path) -> float:
-    """An entry of the table in the file ``path``.
+    """A number in ``table``, which is the content of the file ``path``.
 
     Raises:
-        TrialError: it has none, or one that is no number.
+        TrialError: the entry is missing or not a number.
     """
     value = table.get(key) if isinstance(table, dict) else None
     if not isinstance(value, int | float):
@@ -305,7 +306,7 @@ def _number(table: Any, key: str, path: Path) -> float:
 def _training_facts(policy: Path, low: Path) -> dict[str, float]:
     meta, path = policies.load(policy).meta, policy.with_suffix(".json")
     decimation = _number(meta.get("config"), "decimation", path)
-    hours = decimation * load_low(low)[1].physics.control_dt / 3600.0  # of a decision
+    hours = decimation * load_low(low)[1].physics.control_dt / 3600.0  # per decision
     steps = _number(meta, "steps", path)
     return {
         "steps": steps,
@@ -315,11 +316,11 @@ def _training_facts(policy: Path, low: Path) -> dict[str, float]:
 
 
 def _reached(path: Path, tiles: Sequence[Tile]) -> NDArray[np.bool_]:
-    """Whether the goal was reached on each tile, by the episodes.csv of an evaluation.
+    """Whether the goal was reached on each tile, from the episodes.csv of an evaluation.
 
     Raises:
-        TrialError: one that cannot be read, or that lacks a tile.
-        OSError: it is missing.
+        TrialError: the file cannot be parsed, or lacks the outcome of a tile.
+        OSError: the file is missing.
     """
     try:
         with open(path, newline="", encoding="utf-8") as file:

@@ -1,11 +1,11 @@
-"""The rows of the ablation: what is changed against the whole, as settings."""
+"""The rows of the ablation: changes to the full hierarchy, as settings."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 from tdgc.config import NO_TEACHER
 
-WHOLE = "full"  # what the others are compared with
+WHOLE = "full"  # the variant that the others are compared with
 
 
 @dataclass(frozen=True)
@@ -14,11 +14,11 @@ class Variant:
 
     Attributes:
         name: of the row.
-        what: differs from ``full``, in a few words.
-        settings: of its training; None where nothing is trained.
-        alone: more of them where all variants are trained without a teacher.
+        what: how it differs from ``full``, in a few words.
+        settings: of its training; None if nothing is trained.
+        alone: further settings if all variants are trained without a teacher.
         low: the low policy: as given, without calibration, or with the paper's fixed nominal pose.
-        policy: that is evaluated, as evaluate.py names it.
+        policy: the policy to evaluate, as named by evaluate.py.
     """
 
     name: str
@@ -30,8 +30,10 @@ class Variant:
 
 
 def _discounts(seconds: float) -> tuple[str, ...]:
-    """Settings that discount as much per second, with decisions of ``seconds``, as the default does
-    with its decisions of 0.1 s."""
+    """Settings for decisions every ``seconds`` that discount as much per second as the defaults.
+
+    The defaults, ``gamma`` 0.99 and ``gae_lambda`` 0.95, are for decisions every 0.1 s.
+    """
     share = seconds / 0.1
     return f"ppo.gamma={0.99**share:.6f}", f"ppo.gae_lambda={0.95**share:.6f}"
 
@@ -45,8 +47,8 @@ VARIANTS: tuple[Variant, ...] = (
     Variant(
         "feed-forward",
         "no memory, as many parameters",
-        # Actor and critic have 74,542 and 73,762; with an LSTM they have 74,509 and 73,729, without
-        # the second bias of PyTorch's, which adds nothing that it could learn.
+        # Actor and critic have 74,542 and 73,762 parameters; with an LSTM 74,509 and 73,729, not
+        # counting the second bias of PyTorch's LSTM, which adds nothing that it could learn.
         ("ppo.lstm=null", "ppo.encoder=[]", "ppo.actor=[469,64]", "ppo.critic=[469,64]"),
     ),
     Variant("semantic", "the family, no probes", ("env.cues=semantic",)),
@@ -86,7 +88,7 @@ VARIANTS: tuple[Variant, ...] = (
 )
 #: Rows for trainings with a teacher: without one, every robot is told its family.
 WITH_TEACHER = ("no-exchange", "no-teacher")
-#: With ``--no-teacher`` these stand in their place: what helps it, each taken away.
+#: Rows in their place with ``--no-teacher``: each undoes one setting that helps such a training.
 HELPS: tuple[Variant, ...] = (
     Variant("gait-per-decision", "noise of the gait not held", ("ppo.gait_hold=1",)),
     Variant("gait-per-episode", "noise of the gait held for 20 s", ("ppo.gait_hold=200",)),
@@ -98,7 +100,7 @@ HELPS: tuple[Variant, ...] = (
 
 
 def variants(alone: bool) -> tuple[Variant, ...]:
-    """The rows of an ablation, with a teacher or without."""
+    """The rows of an ablation, with a teacher or without one (``alone``)."""
     if not alone:
         return VARIANTS
     place = [variant.name for variant in VARIANTS].index(WITH_TEACHER[0])

@@ -1,1 +1,1 @@
-"""The benchmark: who drives, episodes, and what is found in them."""
+"""The benchmark: drivers, episodes and their analysis."""

@@ -1,9 +1,8 @@
-"""A scripted law on the high policy's cues, for attribution: what is due to the cues, and what to
-the learning.
+"""A scripted law on the high policy's cues, to separate what learning adds from what the cues give.
 
-``CuesLaw`` stands in for the high policy: it gets the same observation o^H and nothing else, but
-for the benchmark's constants (where starts and goals lie along a tile) and where the low policy
-lands when it leaps.
+``CuesLaw`` stands in for the high policy. It gets the same observation o^H and nothing else, except
+the benchmark's constants (where starts and goals lie along a tile) and where the low policy lands
+when it leaps.
 """
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from tdgc.benchmark.memory import Obstacles, Profile, Reckoning
 from tdgc.config import HighLevelConfig, LowLevelConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
+from tdgc.sim.gaits import raw_phase
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, ZONE
@@ -20,33 +20,36 @@ from tdgc.tasks.leaps import BEYOND, SPEED, Landing, LeapPlan, Motion, leap_comm
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.teacher import STYLES, Style, toward
 
-#: How to walk where no family is told: what rough ground, stairs and slopes have in common.
+#: How to walk where the family is unknown: a compromise for rough ground, stairs and slopes.
 UNKNOWN = Style(0.6, frequency=3.2, swing_height=0.2, stance_width=0.33, uphill=0.45)
 
-# m from a lip, which are worth keeping where it is known to some 5 cm: of 20 tiles each of levels
-# 5, 7 and 9 of Gap 14, 10, 7 were crossed with the teacher's 5 cm, 19, 14, 12 with 8, 17, 20, 15
-# with 12.
+# m, clearance that a foothold should keep from a lip, whose position is known to about 5 cm. Of 20
+# Gap tiles on each of levels 5, 7 and 9, the robots crossed 14, 10 and 7 with the teacher's 5 cm,
+# 19, 14 and 12 with 8 cm, and 17, 20 and 15 with 12 cm.
 _CLEAR = 0.12
-# m below the ground around: a trench, half way down its walls. Planned from lip to lip 26 of 100
-# robots got over level 10, like this 54.
+# m, height relative to the surrounding ground below which a probe is in a trench: half way down the
+# walls. With this, 54 of 100 robots crossed level 10; 26 did when trenches were planned from lip to
+# lip.
 _DEEP = -0.3
-_TALL = 0.35  # m above it: a pillar, as far as no stairs are about
-_GROUND = 0.3  # m, what is further from the standing height is not the ground around
-_WIDEST = 0.35  # m, a trench of level 10 from lip to lip, whose end is not in sight yet
+_TALL = 0.35  # m above the surrounding ground: a pillar, provided that there are no stairs
+_GROUND = 0.3  # m, a probe further than this from the standing height does not see that ground
+_WIDEST = 0.35  # m, assumed width of a trench whose end is out of sight: lip to lip at level 10
 
 
 class Memory:
-    """What the law remembers of M robots.
+    """What the law remembers about M robots.
 
     Attributes:
-        told: (M,) names of families, as the semantic cue has them.
+        told: (M,) family names, from the semantic cue.
         where, profile, obstacles: see ``tdgc.benchmark.memory``.
-        places: (2, M, 32, 2) m, where the probes were a decision ago.
-        gap, pillar: (M,) whether there are trenches, and pillars; told or seen.
-        slope: (M,) rad of the ground across the heading; positive where it rises to the left.
-        x: (M,) m along the tile, a decision ago.
-        plan: of landings; ``planned`` holds the lips (k, 2) m that each robot's plan is for.
-        command: (M, 15) of the last decision.
+        places: (2, M, 32, 2) m, probe positions on both tracks at the previous decision.
+        gap, pillar: (M,) whether there are trenches, or pillars: told by the cue or seen.
+        unknown: (M,) whether the cue reports the family as unknown.
+        slope: (M,) rad, slope of the ground across the heading; positive if it rises to the left.
+        x: (M,) m, position along the tile at the previous decision.
+        plan: the plan of landings.
+        planned: the lips (k, 2) m that each robot's plan was made for.
+        command: (M, 15) commands of the last decision.
     """
 
     def __init__(
@@ -68,11 +71,11 @@ class Memory:
 
 
 class CuesLaw:
-    """A high policy by hand: o^H -> actions, with a ``Memory`` for its state.
+    """A hand-written high policy: o^H -> actions, with a ``Memory`` as its state.
 
     Args:
         low: the low policy's MDP.
-        landing: of the low policy; None for one that does not leap, which walks over trenches.
+        landing: the low policy's landing; None for one that cannot leap and so walks over trenches.
         config: the MDP of the decisions.
     """
 
@@ -89,7 +92,7 @@ class CuesLaw:
     def predict(
         self, obs: NDArray[np.floating], state: Memory | None = None
     ) -> tuple[Array, Memory]:
-        """Actions (M, 13) from o^H (M, size), and what is remembered for the next decision."""
+        """Return actions (M, 13) for o^H (M, size), and the memory for the next decision."""
         rows = np.asarray(obs, dtype=np.float64)
         cue = {name: rows[:, place] for name, place in self._columns.items()}
         distance = cue["goal"][:, 0] / GOAL_SCALE
@@ -104,14 +107,15 @@ class CuesLaw:
         before, state.command = state.command, self._walk(state, distance, bearing)
         if self._landing is not None:
             self._leap(state, cue, bearing, before, self._landing)
-        # A low policy may have been trained on less than the styles ask for.
+        # The styles may exceed the command ranges that the low policy was trained on.
         state.command = np.clip(state.command, self._decoder.low, self._decoder.high)
         return self._decoder.encode(state.command), state
 
     def _look(self, memory: Memory, cue: dict[str, Array]) -> None:
-        """Remember what the probes show."""
+        """Update the memory with what the probes show."""
         probes = PROBE_RANGE * cue["probes"]
-        # The trunk bobs, so heights are against the ground around; most of it is ground.
+        # The trunk bobs, so heights are taken relative to the surrounding ground, the median of
+        # the probes near the standing height.
         level = np.where(np.abs(probes) < _GROUND, probes, np.nan)
         level[np.isnan(level).all(axis=1)] = 0.0
         ground = np.nanmedian(level, axis=1)
@@ -119,7 +123,7 @@ class CuesLaw:
         aside = self._points[:, 1]
         memory.slope = np.arctan(height @ aside / np.sum(aside**2))
         line = height[:, self._ahead]
-        jump = line[:, 2:] - line[:, :-2]  # over 10 cm, where a stair has one step at most
+        jump = line[:, 2:] - line[:, :-2]  # over 10 to 15 cm, one stair step at most
         far = line[:, 2:]
         trench = (jump < -_TALL) & (far < -_TALL)
         pillar = (jump > _TALL) & (far > _TALL)
@@ -134,7 +138,7 @@ class CuesLaw:
             memory.obstacles.add(i, seen[0, i, height[i] > _TALL])
 
     def _walk(self, memory: Memory, distance: Array, bearing: Array) -> Array:
-        """Commands (M, 15) to the goal, around pillars, in the style of the family."""
+        """Return commands (M, 15) to the goal, around pillars, in the style of the family."""
         styles = [STYLES.get(name, UNKNOWN) for name in memory.told]
         command = np.array([style.command() for style in styles])
         fast = np.array([style.speed for style in styles])
@@ -153,15 +157,15 @@ class CuesLaw:
     def _leap(
         self, memory: Memory, cue: dict[str, Array], bearing: Array, before: Array, landing: Landing
     ) -> None:
-        """Turn the commands of robots that have trenches before them into those of leaps.
+        """Replace the commands of robots that have trenches ahead by those of leaps.
 
-        ``before`` (M, 15) are the commands of the decision before.
+        ``before`` (M, 15) are the commands of the previous decision.
         """
         track = memory.profile.track()
         tracks = np.maximum(track, 0).tolist()
         chosen = tracks, np.arange(len(tracks))
         heading, x = memory.where.heading[chosen], memory.where.position[chosen][:, 0]
-        # Half way between the tracks while they cannot be told apart.
+        # Use the mean heading of the two tracks until they can be told apart.
         heading = np.where(track < 0, memory.where.heading.mean(axis=0), heading)
         speed, memory.x = (x - memory.x) / self._dt, x
         leaping = []
@@ -178,9 +182,9 @@ class CuesLaw:
             rows = np.array(leaping)
             leaps = memory.command[rows]
             steer_leap(leaps, heading[rows] + bearing[rows], heading[rows], self._ranges)
-            # In trot and pronk, at a duty factor of 0.5, the clock is the right front foot's phase.
+            # In trot and pronk the right front foot's raw phase is the gait clock.
             phase = np.arctan2(cue["clock"][rows, 1], cue["clock_cosine"][rows, 1])
-            clock = np.mod(phase / (2.0 * np.pi), 1.0)
+            clock = raw_phase(np.mod(phase / (2.0 * np.pi), 1.0), before[rows, INDEX["duration"]])
             commanded = np.full(len(rows), min(SPEED, self._ranges.vx[1]))
             stride = before[rows][:, [INDEX["frequency"], INDEX["stance_length"]]].T
             motion = Motion(x[rows], speed[rows], commanded, clock, *stride)

@@ -1,12 +1,13 @@
-"""Diagnosis: why an episode failed, from its trace; which layer is to blame, and on what evidence.
+"""Diagnosis of a failed episode from its trace: the layer to blame, the cause and the evidence.
 
-- ``terrain``: the tile is of a kind that nothing was trained on.
-- ``execution``: the low policy lost track of its commands, or the robot fell under a sane one.
-- ``decisions``: the commands were carried out, and they led to the failure; or the robot walked
-  into a trench that nothing had looked for.
+- ``terrain``: neither policy was trained on this kind of tile.
+- ``execution``: the low policy failed to track its commands, or the robot fell although the
+  commands were sensible.
+- ``decisions``: the commands were carried out and led to the failure, or the robot walked into a
+  trench that the policy had no cues to see.
 
-Tracking is lost where its errors are larger than in all but a few stretches of episodes that
-reached their goals: ``LIMITS``.
+Tracking counts as lost where its errors exceed ``LIMITS``, that is, where they are larger than in
+all but a few stretches of episodes that reached their goals.
 """
 
 import csv
@@ -29,18 +30,19 @@ from tdgc.sim.terrain import GOAL_BEGIN, MAX_LEVEL, START_END, TILE_SIZE, ZONE, 
 
 LAYERS = ("decisions", "execution", "terrain")
 
-#: m/s away from the goal, asked for on average while judged. In 165 episodes that reached it never
-#: less than 0.4 m/s towards it was, and fast backwards is where tracking is worst.
+#: m/s, mean commanded velocity away from the goal above which the decisions are to blame. In 165
+#: episodes that reached the goal, the mean towards it was never below 0.4 m/s. Tracking is worst
+#: when walking backwards fast; this rule precedes those on tracking errors.
 AWAY = 0.2
-LOOK_BACK = 2.0  # s before the end that are judged: four to eight gait cycles
-SETTLE = 1.0  # s at the start that are not: speeding up from rest, as in the tracking test
-#: m ahead of the hips: a foot that reaches out from there. With hips 0.18 m ahead of the trunk's
-#: centre a trunk was hit at up to 0.25 m from a pillar's edge, and a robot held up by one stood at
-#: up to 0.29 m.
+LOOK_BACK = 2.0  # s, the judged stretch before the end: four to eight gait cycles
+SETTLE = 1.0  # s at the start that are not judged: speeding up from rest, as in the tracking test
+#: m, how far a foot reaches ahead of the hips. With hips 0.18 m ahead of the trunk's centre, the
+#: centre was up to 0.25 m from a pillar's edge when the trunk hit it, and up to 0.29 m when the
+#: robot was held up by a pillar.
 REACH = 0.2
 
 
-#: What a log of a real robot may lack, and a column of the trace that then is empty.
+#: What the log of a real robot may lack, with a trace column that is empty if it does.
 _TRUTH = {
     "velocity": "error_vx",
     "yaw rate": "error_yaw_rate",
@@ -53,12 +55,12 @@ _TRUTH = {
 
 @dataclass(frozen=True)
 class Limit:
-    """What an error of tracking stays below in episodes that succeed.
+    """Bound that a tracking error stays below in successful episodes.
 
     Attributes:
-        unit: of the error.
-        stretch: for its mean over ``LOOK_BACK``.
-        episode: for its mean over a whole episode, by which a timeout is judged.
+        unit: unit of the error.
+        stretch: limit on its mean over ``LOOK_BACK``.
+        episode: limit on its mean over a whole episode, by which a timeout is judged.
     """
 
     unit: str
@@ -66,9 +68,9 @@ class Limit:
     episode: float
 
 
-#: The 95th percentiles of all stretches, and of all episodes, of 168 that reached their goals:
-#: both policies, five episodes on levels 6 and 8 of each family, evaluation seeds 1 and 2. Stairs
-#: make up the upper end.
+#: The 95th percentiles over all stretches, and over all episodes, of 168 that reached their goals:
+#: both policies, five episodes on levels 6 and 8 of each family, evaluation seeds 1 and 2. The
+#: largest errors are on stairs.
 LIMITS: dict[str, Limit] = {
     "velocity": Limit("m/s", 0.24, 0.13),
     "yaw rate": Limit("rad/s", 0.11, 0.08),
@@ -81,12 +83,12 @@ class Diagnosis(EpisodeRecord):
     """A failed episode's row of diagnosis.csv.
 
     Attributes:
-        time_s: s, when it ended.
-        place: where on the tile: a platform, a transition or the zone.
-        feature: the nearest trench, step or pillar and how far it is from the trunk; or empty.
+        time_s: time of the end, in s.
+        place: part of the tile: a platform, a transition or the zone.
+        feature: the nearest trench, step or pillar and its distance from the trunk; may be empty.
         layer: one of ``LAYERS``.
-        cause: what went wrong, in a few words; there is a small number of them.
-        evidence: the numbers that say so.
+        cause: what went wrong, in a few words from a small fixed set.
+        evidence: the numbers that support it.
     """
 
     time_s: float
@@ -98,15 +100,15 @@ class Diagnosis(EpisodeRecord):
 
 
 def diagnose(trace: Trace, hips: float) -> Diagnosis:
-    """Which layer failed in the episode of ``trace``, and why.
+    """Determine which layer failed in the episode of ``trace``, and why.
 
     Args:
-        trace: of an episode that failed. Where it was on no tile, what a simulator alone knows is
-            missing: the evidence says so.
-        hips: m, how far ahead of the trunk's centre the robot's hips are.
+        trace: trace of a failed episode. If it was not on a tile, what only a simulator knows is
+            missing, and the evidence lists it.
+        hips: m, distance of the hips ahead of the trunk's centre.
 
     Raises:
-        ValueError: it did not fail.
+        ValueError: the episode did not fail.
     """
     if trace.outcome == "reached":
         raise ValueError("an episode that reached its goal has not failed")
@@ -128,7 +130,7 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
 
 
 def tile_under(trace: Trace) -> Tile | None:
-    """The tile of an episode; None where it was on none."""
+    """Return the tile of an episode; None if it was not on a tile."""
     if trace.seed == NO_TILE:
         return None
     return tile_of(trace.seed, trace.family, trace.level, trace.episode, trace.condition)
@@ -138,7 +140,7 @@ def tile_under(trace: Trace) -> Tile | None:
 
 
 def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str], str]:
-    """Layer and cause, and the evidence."""
+    """Return the layer and cause, and the evidence."""
     intervals = judged(trace)
     held, at_trench = held_up(trace, tile, hips), False
     if tile is not None:
@@ -151,7 +153,8 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
     }
     lost = [name for name, error in errors.items() if error > limits[name]]
     towards = asked_towards(trace, intervals)
-    # Of a collision on no tile it is said, not measured, that it was not with the ground.
+    # Without a tile, the outcome is reported rather than measured: "collided" then means that the
+    # robot did not hit the ground.
     tripped = trace.outcome == "collided" and tile is not None and not held[-1]
     down = trace.outcome == "fell" or tripped
     if trace.family == "mixed" or trace.level > MAX_LEVEL:
@@ -178,9 +181,10 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
 
 
 def judged(trace: Trace) -> NDArray[np.bool_]:
-    """Which intervals between decisions, (n - 1,), an episode is judged by.
+    """Mask of the intervals between decisions, (n - 1,), by which an episode is judged.
 
-    A timeout by all of them, any other end by the last ``LOOK_BACK``; either without ``SETTLE``.
+    These are all intervals for a timeout and the last ``LOOK_BACK`` for any other end, in both
+    cases without ``SETTLE``.
     """
     time = trace["time"].astype(np.float64)
     last = time[1:] > (0.0 if trace.outcome == "timeout" else time[-1] - LOOK_BACK)
@@ -188,15 +192,15 @@ def judged(trace: Trace) -> NDArray[np.bool_]:
 
 
 def settled(trace: Trace) -> NDArray[np.bool_]:
-    """Intervals between decisions, (n - 1,), that begin after ``SETTLE``."""
+    """Mask of the intervals between decisions, (n - 1,), that begin after ``SETTLE``."""
     return np.asarray(trace["time"][:-1].astype(np.float64) > SETTLE - 1e-6)
 
 
 def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, float]:
-    """Sizes of the mean errors over ``intervals`` (n - 1,), by the names of ``LIMITS``.
+    """Magnitudes of the mean errors over ``intervals`` (n - 1,), keyed by the names of ``LIMITS``.
 
-    A mean over gait cycles: what a trunk sways about its command does not count. Empty without an
-    interval; an error that was not measured is left out.
+    Averaging over gait cycles cancels the sway of the trunk about its command. The result is empty
+    if there is no interval; errors that were not measured are left out.
     """
 
     def mean(name: str) -> float:
@@ -214,7 +218,10 @@ def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, flo
 
 
 def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
-    """Mean velocity commanded towards the goal over ``intervals`` (n - 1,), m/s."""
+    """Mean commanded velocity towards the goal over ``intervals`` (n - 1,), in m/s.
+
+    Without any interval, the mean is over the whole episode.
+    """
     bearing = trace["goal_bearing"][:-1]
     towards = trace["command_vx"][:-1] * np.cos(bearing) + trace["command_vy"][:-1] * np.sin(
         bearing
@@ -225,13 +232,13 @@ def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
 
 
 def has_looked(trace: Trace) -> bool:
-    """Whether the decisions looked at any cue of the terrain."""
+    """Whether the decisions were based on any terrain cue."""
     told = any(family is not None for family in trace["family"])
     return told or bool(np.isfinite(trace["probe_00"]).any())
 
 
 def held_up(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
-    """Where the trunk was so near to a pillar that it may have been held up by it, (n,)."""
+    """Mask of the rows, (n,), in which a pillar is near enough to hold up the robot."""
     x, y = trace["base_x"], trace["base_y"]
     if tile is None:
         return np.zeros(len(x), dtype=bool)
@@ -239,13 +246,16 @@ def held_up(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
 
 
 def free(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
-    """Intervals, (n - 1,), in which tracking is judged: against a pillar or over the edge nothing
-    is tracked, and that is no fault of who tracks."""
+    """Mask of the intervals, (n - 1,), in which tracking is judged.
+
+    Against a pillar or over the edge of the tile no policy can track its commands.
+    """
     return ~(held_up(trace, tile, hips) | near_edge(trace, hips))[1:]
 
 
 def near_edge(trace: Trace, hips: float) -> NDArray[np.bool_]:
-    """Where the trunk was within ``hips`` m of the tile's edge, (n,): feet have nothing there."""
+    """Mask of the rows, (n,), in which the trunk is within ``hips`` m of the tile's edge, where
+    feet have no ground."""
     x, y = trace["base_x"], trace["base_y"]
     inside = np.minimum(np.minimum(x, TILE_SIZE - x), np.minimum(y, TILE_SIZE - y))
     return np.asarray(inside < hips)
@@ -258,7 +268,7 @@ def _evidence(
     limits: dict[str, float],
     towards: float,
 ) -> str:
-    """The numbers that a diagnosis rests on, in words."""
+    """Format the numbers that a diagnosis rests on."""
     words = [
         f"{name} off by {error:.2f} {LIMITS[name].unit} (limit {limits[name]:g})"
         for name, error in errors.items()
@@ -279,7 +289,7 @@ def _evidence(
 
 
 def place_of(x: float) -> str:
-    """The part of the tile at ``x`` m along it."""
+    """Name the part of the tile at ``x`` m along it."""
     if x < START_END:
         return "start platform"
     if x < ZONE[0]:
@@ -290,8 +300,8 @@ def place_of(x: float) -> str:
 
 
 def features(tile: Tile, x: float, y: float) -> Iterator[tuple[str, float]]:
-    """The nearest trench, step and pillar of those that the tile has, each with its distance in m
-    from (x, y) m in the tile's frame; numbered along the way."""
+    """Yield the nearest trench, step and pillar, if the tile has any, each with its distance in m
+    from (x, y) m in the tile's frame. Trenches and steps are numbered along the tile."""
     found = tile.features
     if len(found.trenches):
         away = to_trenches(tile, x)
@@ -306,14 +316,14 @@ def features(tile: Tile, x: float, y: float) -> Iterator[tuple[str, float]]:
 
 
 def to_trenches(tile: Tile, x: ArrayLike) -> Array:
-    """Distances along the way, in m, from ``x`` (...) m to the k trenches, (..., k)."""
+    """Distances along the tile, in m, from ``x`` (...) m to the k trenches, (..., k)."""
     begin, end = tile.features.trenches.T
     along = np.asarray(x)[..., None]
     return np.asarray(np.maximum(np.maximum(begin - along, along - end), 0.0))
 
 
 def to_pillars(tile: Tile, x: ArrayLike, y: ArrayLike) -> Array:
-    """Distances in m from points (...) to the k pillars, (..., k)."""
+    """Distances in m from points (...) to the surfaces of the k pillars, (..., k)."""
     px, py, diameter = tile.features.pillars.T
     away = np.hypot(np.asarray(x)[..., None] - px, np.asarray(y)[..., None] - py)
     return np.asarray(np.maximum(away - 0.5 * diameter, 0.0))
@@ -323,7 +333,7 @@ def to_pillars(tile: Tile, x: ArrayLike, y: ArrayLike) -> Array:
 
 
 def write(diagnoses: Sequence[Diagnosis], path: str | Path) -> None:
-    """Write diagnosis.csv: a row a failed episode, whole or not at all."""
+    """Write diagnosis.csv atomically, one row per failed episode."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, [f.name for f in dataclasses.fields(Diagnosis)])
     writer.writeheader()
@@ -335,9 +345,10 @@ def write(diagnoses: Sequence[Diagnosis], path: str | Path) -> None:
 def count_failures(
     diagnoses: Sequence[Mapping[str, Any]], episodes: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Of each policy and condition its failures: by family and level, and where most is to be won.
+    """Count failures by policy, condition, family and level, and find where most can be gained.
 
-    A layer's points are the failures that it is to blame for, in per cent of all episodes.
+    That is the family and layer with the most failures, which are given in points: per cent of all
+    episodes of the policy and condition.
 
     Args:
         diagnoses: rows of diagnosis.csv.
@@ -376,10 +387,10 @@ def count_failures(
 
 
 def describe(diagnoses: Sequence[Diagnosis], episodes: Sequence[Episode]) -> str:
-    """Failures by family and level, their layers and commonest cause, and where most is to be won.
+    """Describe failures by family and level with their causes, and where most can be gained.
 
     Args:
-        diagnoses: of all failed episodes.
+        diagnoses: those of all failed episodes.
         episodes: all episodes, failed or not.
     """
     lines: list[str] = []

@@ -1,4 +1,4 @@
-"""Who decides on commands: the hierarchy's high policy, or the paper's scripted baseline."""
+"""Drivers that decide on commands: the high policy, the paper's scripted baseline, the teacher."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
@@ -32,14 +32,14 @@ from tdgc.tasks.teacher import Teacher, toward
 
 
 class Driver(ABC):
-    """Drives robots to their goals, step by step.
+    """Drives robots to their goals, one control step at a time.
 
     Attributes:
-        config: the MDP of its decisions; cues "none" where it looks at none.
-        bounds: what its commands stay within.
-        action: (M, 13) of the last decision as the policy gave it; None where none is decoded.
-        told: the family that the semantic cue named; None where it is not looked at.
-        probes: (M, 32) m that the last decision looked at; None where it looked at none.
+        config: the MDP of its decisions, with cues "none" if it uses no cues.
+        bounds: ranges that its commands stay within.
+        action: (M, 13) raw policy output of the last decision; None if the driver decodes none.
+        told: family reported by the semantic cue; None if the driver does not use that cue.
+        probes: (M, 32) m, heights used by the last decision; None if the driver uses none.
     """
 
     config: HighLevelConfig
@@ -50,27 +50,28 @@ class Driver(ABC):
 
     @abstractmethod
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
-        """New episodes for all robots of ``loco``.
+        """Begin new episodes for all robots of ``loco``.
 
         Args:
             loco: M robots at their starts.
             goal: (M, 2) m in the world.
-            family: that the semantic cue names, "unknown" where it names none.
-            noise: of the height probes; None for exact ones.
+            family: family that the semantic cue reports, or "unknown".
+            noise: noise of the height probes; None for exact ones.
         """
 
     @abstractmethod
     def command(self, step: int) -> Array:
-        """Commands (M, 15) for the coming control step number ``step``."""
+        """Return commands (M, 15) for control step number ``step``, the next one."""
 
 
 @dataclass(frozen=True)
 class GoToGoal:
     """``gp``, the paper's baseline: a scripted law over the same frozen low policy.
 
-    Walks in trot with default behaviour parameters, as fast as the distance asks, turning by the
-    heading error, and slows while it faces away. No terrain cues. Gains tuned on training tiles
-    (docs/experiments.md).
+    The robot trots with default behaviour parameters except for swing and body height. Its speed
+    is proportional to the distance, up to a limit, and lower while it faces away from the goal; its
+    yaw rate is proportional to the heading error. It uses no terrain cues. The gains were tuned on
+    training tiles (docs/experiments.md).
     """
 
     top_speed: float = 0.6  # m/s
@@ -80,7 +81,7 @@ class GoToGoal:
     body_height: float = 0.04  # m, added to the standing height
 
     def law(self, position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
-        """Forward speed and yaw rate: positions (M, 2), headings (M,), goals (M, 2)."""
+        """Return forward speed and yaw rate for positions (M, 2), headings (M,), goals (M, 2)."""
         offset = goal - position
         error = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - yaw)
         distance = np.linalg.norm(offset, axis=1)
@@ -88,14 +89,14 @@ class GoToGoal:
 
 
 class BaselineDriver(Driver):
-    """Drives robots by ``GoToGoal``, at every control step; it knows no families.
+    """Drives robots by ``GoToGoal``, at every control step, whatever the family.
 
-    Commands of the law outside ``bounds`` are clipped to them: it has one setting for all low
-    policies.
+    Commands outside ``bounds`` are clipped, because the law has one setting for all low policies.
 
     Args:
         law: the script.
-        bounds: what the low policy was trained on; the ranges of ``CommandRanges`` by default.
+        bounds: command ranges that the low policy was trained on; those of ``CommandRanges`` by
+            default.
     """
 
     def __init__(self, law: GoToGoal | None = None, bounds: CommandRanges | None = None) -> None:
@@ -119,13 +120,14 @@ class BaselineDriver(Driver):
 
 
 class TeacherDriver(Driver):
-    """Drives robots by the scripted teacher, decided as often as the hierarchy decides.
+    """Drives robots by the scripted teacher, which decides as often as the hierarchy.
 
-    It is told what the hierarchy has to find out, so it is no rival: it shows what the low policy
-    can do when it is told the right thing.
+    It is told what the hierarchy has to infer, so it is no competitor: it shows what the low policy
+    can do under good commands.
 
     Args:
-        low, config: the low policy, whose leaps are measured first.
+        low: the low policy; its landings are measured first.
+        config: the MDP of the low policy.
     """
 
     def __init__(self, low: Policy, config: LowLevelConfig) -> None:
@@ -149,20 +151,20 @@ class TeacherDriver(Driver):
 
 
 class Decides(Protocol):
-    """What the hierarchy needs of a high policy."""
+    """What the hierarchy needs from a high policy."""
 
     def predict(self, obs: NDArray[np.float32], state: Any) -> tuple[NDArray[np.floating], Any]:
-        """o^H of M robots and the state returned before, None at first -> actions (M, 13) and the
+        """Map o^H of M robots and the previous state, None at first, to actions (M, 13) and the
         next state."""
 
 
 class HierarchyDriver(Driver):
-    """Drives robots by the high policy (paper Sec. IV-B), ``tdgc``; recurrent or feed-forward.
+    """Drives robots by the high policy (paper Sec. IV-B), ``tdgc``, recurrent or feed-forward.
 
-    A decision is deterministic and its commands are held for ``decimation`` control steps.
+    Decisions are deterministic; their commands are held for ``decimation`` control steps.
 
     Args:
-        high, config: what ``load_high`` returned.
+        high, config: the high policy and its MDP, as ``load_high`` returns them.
     """
 
     def __init__(self, high: Decides, config: HighLevelConfig) -> None:
@@ -195,7 +197,7 @@ class HierarchyDriver(Driver):
         return self._command
 
     def _observe(self, decision: int) -> NDArray[np.float32]:
-        """o^H, as in training."""
+        """Return o^H, as in training."""
         rows = np.arange(self._loco.num_robots)
         if decision == 0:
             self._sensor.begin(rows)
@@ -223,12 +225,12 @@ class HierarchyDriver(Driver):
 def load_high(
     path: str | Path, low: Policy, low_config: LowLevelConfig
 ) -> tuple[Policy, HighLevelConfig]:
-    """A high policy and the MDP it was trained on, for use on the low policy ``low``.
+    """Load a high policy and the MDP it was trained on, for use with the low policy ``low``.
 
     Raises:
-        ValueError: a file that cannot be used, one that is no high policy, or one that was trained
-            on a low policy with another robot, observation, control rate or narrower commands; the
-            message names the mismatch.
+        ValueError: the file cannot be used, is not a high policy, or was trained on a low policy
+            with another robot, observation or control rate, or with commands that ``low`` was not
+            trained on; the message names the mismatch.
     """
     high = policies.load(path)
     if high.action_dim != NUM_ACTIONS:

@@ -1,8 +1,8 @@
-"""Evaluation (TDGC-Bench): episodes on fixed tiles, every policy on the same ones.
+"""Evaluation (TDGC-Bench): episodes on fixed tiles, the same for every policy.
 
-Episodes run in batches, each in a world of its own that holds one tile a robot. A batch depends on
-its policy, condition and tiles alone, not on how many processes share the batches, so neither does
-the table.
+Episodes run in batches, each in its own world with one tile per robot. A batch depends only on its
+policy, condition and tiles. The table therefore does not depend on how many processes share the
+batches.
 """
 
 import dataclasses
@@ -38,18 +38,19 @@ from tdgc.tasks.executor import Carries, Executor
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import GOING, HORIZON, OUTCOMES, outcome
 
-BATCH = 50  # episodes a world: enough to keep numpy busy, few enough to share out evenly
-POSE_SECONDS = 0.2  # between two poses of a track: 20 cm of walking at most
+BATCH = 50  # episodes per world: enough to keep numpy busy, few enough to distribute evenly
+POSE_SECONDS = 0.2  # s between two poses of a track, in which a robot walks 20 cm at most
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One evaluation condition (benchmark); everything is nominal unless it says otherwise.
+    """One evaluation condition of the benchmark; what it does not set is nominal.
 
     Attributes:
-        what: it changes, for people.
-        levels, families: where the condition is run; None for those asked for.
-        episodes_share: of the episodes asked for, a cell (100 nominal, 20 for the others).
+        what: what the condition changes, as text for people.
+        levels, families: where the condition is run; None for the requested ones.
+        episodes_share: share of the requested episodes per cell that is run (by default 100
+            episodes nominal, 20 in the others).
     """
 
     what: str
@@ -58,19 +59,19 @@ class Condition:
     friction: float | None = None
     payload: float = 0.0  # kg
     push_speed: float = 0.0  # m/s, every 3 s
-    motor: float = 1.0  # times torque limits and gains
+    motor: float = 1.0  # factor on torque limits and gains
     latency: float = 0.0  # s
     physics_hz: int | None = None
-    noise: RandomisationConfig | None = None  # of the sensors; the gait clock starts at random too
-    told: bool = True  # the semantic cue names the family; "unknown" otherwise
-    mirrored: bool = False  # left and right of every tile exchanged
+    noise: RandomisationConfig | None = None  # of the sensors; also starts the gait clock at random
+    told: bool = True  # whether the semantic cue names the family; "unknown" otherwise
+    mirrored: bool = False  # whether left and right of every tile are exchanged
     episodes_share: float = 0.2
 
 
 PUSH_INTERVAL = 3.0  # s (benchmark's `pushes`)
 _NOISE = RandomisationConfig(probe_delay=1.0)
 
-#: The conditions of the benchmark by name.
+#: The conditions of the benchmark, by name.
 CONDITIONS: dict[str, Condition] = {
     "nominal": Condition("nothing", episodes_share=1.0),
     "levels-11-12": Condition("levels 11, 12", levels=(11, 12)),
@@ -93,7 +94,7 @@ CONDITIONS: dict[str, Condition] = {
 
 @dataclass(frozen=True)
 class Cell:
-    """A batch of episodes: numbers ``first`` to ``first + count`` of one family and level."""
+    """A batch of episodes of one family and level: ``count`` of them, from number ``first`` on."""
 
     policy: str
     condition: str
@@ -103,7 +104,7 @@ class Cell:
     count: int
 
     def record(self, k: int, seed: int, outcome: int) -> dict[str, Any]:
-        """The fields of ``EpisodeRecord`` of robot k, whose outcome indexes ``OUTCOMES``."""
+        """Return robot k's fields of ``EpisodeRecord``; ``outcome`` indexes ``OUTCOMES``."""
         return {
             "policy": self.policy,
             "condition": self.condition,
@@ -117,7 +118,8 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeRecord:
-    """What every record of an episode begins with: which one it was, and one of ``OUTCOMES``."""
+    """Fields that every record of an episode begins with: its identity and outcome, one of
+    ``OUTCOMES``."""
 
     policy: str
     condition: str
@@ -129,21 +131,24 @@ class EpisodeRecord:
 
     @property
     def name(self) -> str:
-        """A name for the episode's files, a different one for each of an evaluation."""
+        """Name for the episode's files, unique within an evaluation."""
         where = f"{self.policy}_{self.condition}_{file_label(self.family)}"
         return f"{where}_{self.level:02d}_{self.episode:03d}"
 
 
 @dataclass(frozen=True, eq=False)
 class Episode(EpisodeRecord):
-    """A row of episodes.csv, and where the robot went.
+    """A row of episodes.csv, and the path of the robot.
 
     Attributes:
-        energy_j: J, mechanical: ``joint_power`` at the end of each control step, times its length.
-        shares: of its time in each gait of ``GAITS``, as commanded.
-        goal: (2,) m, in the tile's frame.
-        track: (n, 3) x, y in m in the tile's frame and heading in rad, every ``POSE_SECONDS`` from
-            the start and once more at the end.
+        time_s: duration in s.
+        path_m: length of the trunk's path in m.
+        energy_j: mechanical energy in J: ``joint_power`` at the end of each control step, times
+            the step's length.
+        shares: share of the time in each gait of ``GAITS``, as commanded.
+        goal: (2,) m in the tile's frame.
+        track: (n, 3), x and y in m in the tile's frame and heading in rad, every ``POSE_SECONDS``
+            from the start and once more at the end.
     """
 
     time_s: float
@@ -154,7 +159,7 @@ class Episode(EpisodeRecord):
     track: Array
 
     def row(self) -> dict[str, Any]:
-        """The row, with one column a gait share."""
+        """Return the row of episodes.csv, with one column per gait share."""
         beside = ("shares", "goal", "track")
         names = [f.name for f in dataclasses.fields(self) if f.name not in beside]
         row = {name: getattr(self, name) for name in names}
@@ -164,70 +169,76 @@ class Episode(EpisodeRecord):
 
 
 def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
-    """The condition's physics: its rate, at the low policy's control rate."""
+    """Return the low policy's physics, at the condition's physics rate if it sets one."""
     physics = config.physics
     if condition.physics_hz is not None:
         substeps = round(physics.control_dt * condition.physics_hz)
-        # One torque per physics step, as a motor driver at that rate has it.
+        # Torque is updated at each physics step, as by a motor driver at that rate.
         physics = dataclasses.replace(physics, substeps=substeps, hold=1)
     return physics
 
 
 def tile_of(seed: int, family: str, level: int, episode: int, condition: str = "nominal") -> Tile:
-    """The tile of one episode, with its start and goal: the same for every policy."""
+    """Return the tile of one episode, with its start and goal; it is the same for every policy."""
     rng = tile_rng(seed, family, level, episode, EVAL_STREAM)
     tile = make_tile(family, level / MAX_LEVEL, rng)
     return tile.mirrored() if CONDITIONS[condition].mirrored else tile
 
 
-# What else an episode draws, each from a generator of its own (the values only have to differ):
+# Purposes for which an episode draws random values, each from its own generator. The values only
+# have to differ.
 _PUSHES, _CLOCK, _SENSORS, _PROBES = 1, 2, 3, 4
 
 
 def episode_draws(cell: Cell, seed: int, purpose: int) -> EpisodeDraws:
-    """What the episodes of a cell draw for a purpose: the same for every policy, in any batch."""
+    """Return a cell's draws for a purpose: the same for every policy, in any batch."""
     where = EVAL_STREAM, seed, family_number(cell.family), cell.level
     return EpisodeDraws((*where, cell.first + k, purpose) for k in range(cell.count))
 
 
 def push_velocities(cell: Cell, seed: int, speed: float, pushes: int) -> Array:
-    """Push k of each episode, (count, pushes, 3) m/s."""
+    """Velocity changes of the pushes, (count, pushes, 3) m/s, in random horizontal directions."""
     angle = episode_draws(cell, seed, _PUSHES).uniform(-np.pi, np.pi, (cell.count, pushes))
     return speed * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
 
 
 def joint_power(state: RobotState) -> Array:
-    """Mechanical power that the joints give or take, (M,) W: no motor wins back what it brakes."""
+    """Sum of the absolute mechanical power of the joints, (M,) W: braking recovers no energy."""
     return np.asarray(np.abs(state.torque * state.qd).sum(axis=1))
 
 
 class Watcher(Protocol):
-    """Looks on while a batch runs; it must change nothing."""
+    """Observes a batch while it runs; it must not change anything."""
 
     def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
-        """The robots stand at their starts; ``goal`` (M, 2) m in the world."""
+        """Handle the beginning, with robots at their starts; ``goal`` is (M, 2) m in the world."""
 
     def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
-        """After control step number ``step`` of the robots ``live`` (n,); ``outcome`` (M,) indexes
-        ``OUTCOMES`` and is -1 for those that go on."""
+        """Handle the end of control step number ``step``.
+
+        ``live`` (n,) are the robots that took part in it; ``outcome`` (M,) indexes ``OUTCOMES`` and
+        is -1 for robots whose episodes continue.
+        """
 
 
 class Batch:
     """The robots of a cell, each on its tile, under the cell's condition.
 
     Args:
-        cell: which episodes.
-        config: of the low policy.
-        seed: of the evaluation's tiles.
-        make_world: of the field; a Bullet world by default.
+        cell: the episodes to run.
+        config: the MDP of the low policy.
+        seed: seed of the evaluation's tiles.
+        make_world: makes a world from the tile field; a Bullet world by default.
 
     Attributes:
         cell, seed: as given.
         field: (M, 1) tiles.
         loco: the robots, at their starts.
         goal: (M, 2) m in the world.
-        told: family that the semantic cue names.
-        sensors, probes: errors of what the low policy observes and of the height probes.
+        origin: (M, 2) m, origins of the tiles in the world.
+        told: family that the semantic cue reports.
+        sensors, probes: noise of the low policy's observations and of the height probes; None
+            without noise.
     """
 
     def __init__(
@@ -243,7 +254,7 @@ class Batch:
         for k in rows:
             tile = tile_of(seed, cell.family, cell.level, cell.first + int(k), cell.condition)
             self.field.place(int(k), 0, tile)
-        self.field.heights.setflags(write=False)  # for a faster world
+        self.field.heights.setflags(write=False)  # the world is faster if they cannot change
         self.told = cell.family if condition.told else "unknown"
         self.sensors = self.probes = None
         clock = np.zeros(cell.count)
@@ -273,10 +284,10 @@ class Batch:
 
 
 class EpisodeLog:
-    """What happens in a batch, control step by control step: at the end an ``Episode`` each.
+    """Logs a batch at every control step and makes an ``Episode`` for each robot.
 
     Attributes:
-        outcome: (M,) index into ``OUTCOMES``, -1 for robots that go on.
+        outcome: (M,) index into ``OUTCOMES``, -1 for robots whose episodes continue.
     """
 
     def __init__(self, batch: Batch) -> None:
@@ -293,15 +304,15 @@ class EpisodeLog:
 
     @property
     def live(self) -> NDArray[np.intp]:
-        """The robots whose episodes go on, (n,)."""
+        """Indices of the robots whose episodes continue, (n,)."""
         return np.flatnonzero(self.outcome == GOING)
 
     def add(self, step: int) -> None:
-        """Look at the robots after control step number ``step``.
+        """Log the state of the robots after control step number ``step``.
 
         Raises:
-            FloatingPointError: one has blown up. Its fellows in Bullet would fall through the
-                ground from now on.
+            FloatingPointError: a robot's position is not finite. In Bullet, the other robots would
+                fall through the ground from now on.
         """
         batch, state, live = self._batch, self._batch.loco.world.state, self.live
         if not np.isfinite(state.position).all():
@@ -318,9 +329,9 @@ class EpisodeLog:
             self._poses.append(self._pose())
 
     def episodes(self) -> list[Episode]:
-        """An episode each, in order, once all have ended."""
+        """Return one episode per robot, in order, once all have ended."""
         cell, last = self._batch.cell, self._pose()
-        kept = -(-self._steps // self._pose_every)  # poses taken while it was up
+        kept = -(-self._steps // self._pose_every)  # number of poses before the end
         return [
             Episode(
                 **cell.record(k, self._batch.seed, self.outcome[k]),
@@ -335,7 +346,7 @@ class EpisodeLog:
         ]
 
     def _pose(self) -> Array:
-        """x, y in m in the tile's frame and heading in rad, (M, 3)."""
+        """Return x, y in m in the tile's frame and heading in rad, (M, 3)."""
         state = self._batch.loco.world.state
         return np.column_stack([state.position[:, :2] - self._batch.origin, state.yaw])
 
@@ -346,14 +357,14 @@ def run_cell(
     """Run a batch of episodes to their ends.
 
     Args:
-        cell: which episodes.
+        cell: the episodes to run.
         low: the frozen low policy.
-        driver: what commands it.
-        seed: of the evaluation's tiles.
-        watchers: who look on.
+        driver: commands the low policy.
+        seed: seed of the evaluation's tiles.
+        watchers: observers of the batch.
 
     Returns:
-        An episode each, in order.
+        One episode per robot, in order.
     """
     batch = Batch(cell, load_low(low)[1], seed)
     try:
@@ -374,7 +385,7 @@ def closed_loop(
     log: EpisodeLog,
     watchers: Sequence[Watcher] = (),
 ) -> None:
-    """The paper's closed loop (Sec. III), until every episode of a batch has ended."""
+    """Run the paper's closed loop (Sec. III) until every episode of a batch has ended."""
     for step in itertools.count():
         live = log.live
         if not live.size:
@@ -400,7 +411,7 @@ def plan(
     levels: Sequence[int],
     episodes: int,
 ) -> list[Cell]:
-    """All batches of an evaluation, in the order of the table."""
+    """List all batches of an evaluation, in the order of the table."""
     cells = []
     for policy in policies:
         for name in conditions:
@@ -415,10 +426,10 @@ def plan(
 
 
 def complete(episodes: Sequence[Episode], cells: Sequence[Cell]) -> list[Episode]:
-    """The episodes of those policies, conditions, families and levels that have all of theirs.
+    """Keep the episodes whose combination of policy, condition, family and level is complete.
 
     Args:
-        episodes: that have been run.
+        episodes: the episodes run so far.
         cells: all batches of the evaluation.
     """
 

@@ -1,4 +1,4 @@
-"""Flags of an evaluation, in whatever simulator: which episodes, how many at once, where to."""
+"""Flags shared by the evaluations in all simulators: episodes, workers and results folder."""
 
 import argparse
 from pathlib import Path
@@ -11,7 +11,7 @@ Group: TypeAlias = argparse._ArgumentGroup
 
 
 class Groups(NamedTuple):
-    """Of an evaluation's flags, for those that are not in every evaluation."""
+    """Argument groups of an evaluation, to which a script adds the flags that only it has."""
 
     episodes: Group
     policies: Group
@@ -20,10 +20,10 @@ class Groups(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
-    """Flags that ``read`` reads; ``out`` is where results go by default.
+    """Add the flags that evaluations share; ``out`` is the default results folder.
 
-    Levels and families are None if they are not given, until ``read`` fills in the default: so a
-    script can refuse them where they would say nothing.
+    Levels and families are None if not given, until ``read`` fills in the defaults, so that a
+    script can reject them where they would have no effect.
     """
     titles = "episodes", "policies", "what is looked at", "machine"
     groups = Groups(*map(parser.add_argument_group, titles))
@@ -56,11 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
 
 
 def read(args: argparse.Namespace) -> None:
-    """Turn levels, families and workers into what they name, in place.
+    """Parse levels, families and workers in place, and check the other flags.
 
     Raises:
-        ValueError: flags that cannot be used, or a file of heights that cannot.
-        OSError: a file of heights that cannot be read.
+        ValueError: a flag or a file of heights cannot be used.
+        OSError: a file of heights cannot be read.
     """
     args.levels = choose_levels("6-10" if args.levels is None else args.levels)
     families = "all" if args.families is None else args.families
@@ -81,10 +81,10 @@ def read(args: argparse.Namespace) -> None:
 def choose(
     text: str, allowed: tuple[str, ...], everything: tuple[str, ...], what: str
 ) -> tuple[str, ...]:
-    """The names in a comma-separated flag; ``all`` stands for ``everything``.
+    """Parse a comma-separated list of names; ``all`` stands for ``everything``.
 
     Raises:
-        ValueError: a name that is not allowed, or one of them twice.
+        ValueError: a name is not allowed or is given twice.
     """
     names = everything if text == "all" else tuple(text.split(","))
     for name in names:
@@ -96,10 +96,10 @@ def choose(
 
 
 def choose_levels(text: str) -> tuple[int, ...]:
-    """``6-10`` or ``0,5,10`` as levels.
+    """Parse levels such as ``6-10`` or ``0,5,10``.
 
     Raises:
-        ValueError: not numbers, outside 0-12, or one of them twice.
+        ValueError: a level is not a number, is outside 0-12 or is given twice.
     """
     spans: list[range] = []
     for part in text.split(","):

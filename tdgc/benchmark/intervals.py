@@ -1,16 +1,20 @@
-"""Success rates, and differences of two on the same tiles, with their 95 % intervals."""
+"""Success rates and paired differences on the same tiles, with their 95 % intervals."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: 95 % of a normal distribution are within so many deviations.
+#: 95 % of a normal distribution lies within this many standard deviations of the mean.
 Z_95 = 1.959964
 
 
 def wilson_interval(reached: int, n: int, z: float = Z_95) -> tuple[float, float]:
-    """Wilson score interval of a rate, 95 % by default (Wilson 1927)."""
+    """Wilson score interval of a rate, 95 % by default (Wilson 1927).
+
+    Raises:
+        ValueError: ``reached`` or ``n`` is out of range.
+    """
     if not 0 <= reached <= n or n < 1:
         raise ValueError(f"need 0 <= reached <= n and n >= 1, not {reached} of {n}")
     rate = reached / n
@@ -22,14 +26,14 @@ def wilson_interval(reached: int, n: int, z: float = Z_95) -> tuple[float, float
 def paired_interval(
     both: int, first: int, second: int, neither: int, z: float = Z_95
 ) -> tuple[float, float]:
-    """Interval of the difference of two rates on the same tiles, the first's less the second's.
+    """Interval of the difference between two rates on the same tiles, the first minus the second.
 
-    95 % by default: method 10 of Newcombe (1998, Statistics in Medicine 17, 2635-2650), which joins
-    the Wilson intervals of both rates by their correlation.
+    95 % by default: method 10 of Newcombe (1998, Statistics in Medicine 17, 2635-2650), which
+    combines the Wilson intervals of both rates by their correlation.
 
     Args:
         both, first, second, neither: number of tiles on which both succeeded, only the first, only
-            the second, neither.
+            the second, or neither.
         z: quantile of the normal distribution.
     """
     n = both + first + second + neither
@@ -52,8 +56,15 @@ def paired_interval(
 
 
 def rates(reached: ArrayLike) -> dict[str, float]:
-    """Of episodes, each with whether it reached the goal, (n,), or (seeds, n) on the same n tiles:
-    how many (n), ``reached`` of them, rate, and its interval ci_low, ci_high."""
+    """Success rate of episodes, with its interval.
+
+    Args:
+        reached: whether each episode reached the goal, (n,), or (seeds, n) on the same n tiles.
+
+    Returns:
+        The number of episodes ``n``, the successes ``reached``, the ``rate``, and its interval
+        ``ci_low``, ``ci_high``.
+    """
     every = np.atleast_2d(np.asarray(reached, dtype=bool))
     n, good = every.size, int(every.sum())
     low, high = wilson_interval(good, n, Z_95 * wider(every))
@@ -61,9 +72,16 @@ def rates(reached: ArrayLike) -> dict[str, float]:
 
 
 def difference(pairs: ArrayLike) -> dict[str, float]:
-    """Of episodes of two policies on the same tiles, each with whether the first and the second
-    reached the goal, (n, 2), or (seeds, n, 2): how many (n), gained and lost (only the first, only
-    the second reached it), the ``difference`` of the rates and its interval ci_low, ci_high."""
+    """Difference between the success rates of two policies on the same tiles, with its interval.
+
+    Args:
+        pairs: whether the first and the second policy reached the goal of each tile, (n, 2), or
+            (seeds, n, 2).
+
+    Returns:
+        The number of pairs ``n``, the goals ``gained`` (only the first policy reached it) and
+        ``lost`` (only the second), the ``difference``, and its interval ``ci_low``, ``ci_high``.
+    """
     both_sides = np.asarray(pairs, dtype=bool)
     one, other = np.atleast_2d(both_sides[..., 0]), np.atleast_2d(both_sides[..., 1])
     both, gained, lost, neither = (
@@ -82,13 +100,13 @@ def difference(pairs: ArrayLike) -> dict[str, float]:
 
 
 def wider(values: NDArray[Any]) -> float:
-    """How much wider the interval of a mean over ``values`` (seeds, n) is than if every one of them
-    were of a tile of its own.
+    """Factor by which the interval of a mean over ``values`` (seeds, n) is wider than it would be
+    if each value came from its own tile.
 
-    The root of the design effect of a sample in clusters, which here are the seeds on a tile: 1
-    with one seed or where a tile decides nothing, the root of the number of seeds where all of them
-    do the same.
+    This is the square root of the design effect of cluster sampling; a cluster is the seeds on one
+    tile. It is 1 with one seed or if the tile has no influence, and the root of the number of seeds
+    if all of them always agree.
     """
     spread = values.var()
-    share = values.mean(axis=0).var() / spread if spread > 0.0 else 1.0  # due to the tiles
+    share = values.mean(axis=0).var() / spread if spread > 0.0 else 1.0  # explained by the tiles
     return max(1.0, float(np.sqrt(len(values) * share)))

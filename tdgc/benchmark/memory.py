@@ -1,6 +1,6 @@
-"""What a script may remember of the high policy's cues: where it is, what it saw.
+"""What the scripted law remembers of the high policy's cues: where the robot is and what it saw.
 
-The high policy has a recurrent state for that.
+The high policy has its hidden state for that.
 """
 
 import numpy as np
@@ -13,19 +13,20 @@ from tdgc.tasks.rules import GOAL_RADIUS
 
 
 class Reckoning:
-    """Where M robots are on their tiles, from the goal cue and the commands.
+    """Estimates where M robots are on their tiles from the goal cue and the commands.
 
-    Distance and bearing of the goal leave the heading open. At the start they leave only a sign
-    open, since starts and goals are at known x; from then on the heading follows from how the
-    bearing changes, less what sideways motion changes of it. So there are two tracks, the goal to
-    the left of straight ahead or to the right of it, mirror images at first.
+    Distance and bearing of the goal alone do not determine the heading. At the start only a sign
+    is ambiguous, because starts and goals have known x. From then on, the heading follows from the
+    change of the bearing, corrected for motion across the line to the goal. So there are two
+    tracks, with the goal to the left or to the right of the tile's x direction as seen from the
+    start; at first they are mirror images.
 
     Args:
         distance, bearing: (M,) m and rad, the goal cue at the start.
 
     Attributes:
-        heading: (2, M) rad against the tile's x.
-        position: (2, M, 2) m; x in the tile's frame, y from the goal's.
+        heading: (2, M) rad relative to the tile's x axis.
+        position: (2, M, 2) m; x in the tile's frame, y relative to the goal.
     """
 
     def __init__(self, distance: Array, bearing: Array) -> None:
@@ -35,10 +36,10 @@ class Reckoning:
         self._place(distance, bearing)
 
     def move(self, distance: Array, bearing: Array, velocity: Array, dt: float) -> None:
-        """Go on to the goal cue ``dt`` s later, ``velocity`` (M, 2) m/s in the heading frame having
-        been commanded meanwhile."""
+        """Update the estimate with the goal cue ``dt`` s later, after ``velocity`` (M, 2) m/s in
+        the heading frame was commanded."""
         sideways = velocity[:, 1] * np.cos(self._bearing) - velocity[:, 0] * np.sin(self._bearing)
-        near = np.maximum(distance, GOAL_RADIUS)  # nearer the bearing says nothing
+        near = np.maximum(distance, GOAL_RADIUS)  # closer in, the bearing is uninformative
         turned = wrap_angle(bearing - self._bearing) + dt * sideways / near
         self.heading = wrap_angle(self.heading - turned)
         self._bearing = bearing
@@ -50,30 +51,33 @@ class Reckoning:
         self.position = np.array([GOAL_X, 0.0]) - distance[:, None] * ahead
 
     def points(self, points: Array) -> Array:
-        """``points`` (n, 2) m of the heading frame on both tracks, (2, M, n, 2) m."""
+        """Transform ``points`` (n, 2) m from the heading frame, on both tracks: (2, M, n, 2) m."""
         c, s = np.cos(self.heading)[..., None], np.sin(self.heading)[..., None]
         x, y = points.T
         return self.position[..., None, :] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
 class Profile:
-    """What M robots have probed along their ways: ground or trench, by x, on both tracks.
+    """What M robots have probed along x, on both tracks: ground or trench.
 
-    A trench crosses the whole tile. So on the right track all probes of one x agree.
+    A trench crosses the whole tile, so on the correct track all probes at one x agree.
     """
 
-    _BIN = 0.01  # m, of the line ahead, from which lips are found
-    _WIDE = 0.05  # m, of all probes, by which tracks are told apart
-    _SURE = 2.0  # disagreeing probes more that rule a track out: a lip alone makes one or two
+    _BIN = 0.01  # m, bin of the probes straight ahead, from which lips are found
+    _WIDE = 0.05  # m, bin of all probes, by which the tracks are told apart
+    _SURE = 2.0  # excess of disagreeing probes that rules out a track: a lip alone makes 1 or 2
 
     def __init__(self, num_robots: int) -> None:
         size = round((TILE_SIZE + 2.0) / self._BIN)
-        self._line = np.zeros((2, 2, num_robots, size))  # track, ground or trench
+        self._line = np.zeros((2, 2, num_robots, size))  # track, ground or trench, robot, bin
         self._all = np.zeros((2, 2, num_robots, round(size * self._BIN / self._WIDE)))
 
     def add(self, x: Array, deep: NDArray[np.bool_], ahead: NDArray[np.bool_]) -> None:
-        """Probes at ``x`` (2, M, n) m, on either track, some of them ``deep`` (M, n); lips are
-        found from those on the line ``ahead`` (n,)."""
+        """Add probes at ``x`` (2, M, n) m on the two tracks.
+
+        ``deep`` (M, n) marks those in a trench, and ``ahead`` (n,) those straight ahead, from
+        which lips are found.
+        """
         rows = np.arange(len(deep))[:, None]
         for counts, width, some in (
             (self._all, self._WIDE, np.ones_like(ahead)),
@@ -84,14 +88,15 @@ class Profile:
                 np.add.at(counts[track], (deep[:, some].astype(int), rows, place[track]), 1.0)
 
     def track(self) -> NDArray[np.int64]:
-        """Which track each robot is on, (M,): 0, 1, or -1 while they cannot be told apart."""
+        """Return the track that each robot is on, (M,): 0, 1, or -1 while they cannot be told
+        apart."""
         ground, deep = self._all[:, 0], self._all[:, 1]
         odd = np.sum(ground * deep / np.maximum(ground + deep, 1.0), axis=-1)
         return np.where(np.abs(odd[0] - odd[1]) < self._SURE, -1, odd.argmin(axis=0))
 
     def trenches(self, robot: int, track: int, widest: float) -> Array:
-        """x of the lips (k, 2) m of the trenches found; one whose end is out of sight is taken for
-        ``widest`` m."""
+        """Return x of the lips of the trenches found, (k, 2) m; a trench whose end is out of sight
+        is taken to be ``widest`` m wide."""
         ground, deep = self._line[track, :, robot]
         known = np.flatnonzero(ground + deep)
         inside = deep[known] > ground[known]
@@ -104,21 +109,21 @@ class Profile:
         return np.column_stack([begins, ends])
 
     def seen(self, robot: int, track: int) -> float:
-        """The largest x that was probed ahead, in m."""
+        """Return the largest x in m that was probed straight ahead."""
         return float(np.flatnonzero(self._line[track, :, robot].sum(axis=0))[-1] * self._BIN)
 
 
 class Obstacles:
     """Pillars that M robots have seen, and the way around them.
 
-    Each robot keeps the cells in which something tall stood, and plans on a window around itself:
-    beyond the window the way to the goal is straight.
+    Each robot keeps the cells in which it saw something tall and plans in a window around itself;
+    beyond the window it assumes a straight way to the goal.
     """
 
-    _CELL = 0.05  # m, of what was seen
-    _STEP, _HALF = 0.1, 12  # m and cells: the window is 2.5 m wide
-    _WIDE = 0.5  # m from a pillar, where it ceases to cost
-    _AHEAD = 0.02  # m per rad, so that near ties go to the straight way
+    _CELL = 0.05  # m, grid of what was seen
+    _STEP, _HALF = 0.1, 12  # cell in m, cells on either side: the window is 2.5 m wide
+    _WIDE = 0.5  # m, distance from a pillar from which on it adds no cost
+    _AHEAD = 0.02  # m per rad off the straight way, which breaks near ties in its favour
     _RAYS = np.linspace(-np.pi, np.pi, 48, endpoint=False)
 
     def __init__(self, num_robots: int) -> None:
@@ -127,12 +132,15 @@ class Obstacles:
         self._window = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
 
     def add(self, robot: int, points: Array) -> None:
-        """Something tall at ``points`` (n, 2) m."""
+        """Add ``points`` (n, 2) m at which something tall was seen."""
         self._seen[robot].update(map(tuple, np.round(points / self._CELL).astype(int).tolist()))
 
     def direction(self, robot: int, at: Array, goal: Array, ahead: float) -> float:
-        """Where to go from ``at`` (2,) m to get to ``goal`` (2,) m, in rad; ``ahead`` rad, the
-        straight way, where nothing is in it."""
+        """Return the direction in rad to take from ``at`` (2,) m to ``goal`` (2,) m.
+
+        This is ``ahead`` rad, the straight way, if nothing was seen nearby or the goal is within
+        ``LOOK``.
+        """
         seen = self._CELL * np.array(sorted(self._seen[robot]), dtype=float).reshape(-1, 2)
         seen = seen[(np.abs(seen - at) < self._STEP * self._HALF + self._WIDE).all(axis=1)]
         if not seen.size or np.linalg.norm(goal - at) < LOOK:

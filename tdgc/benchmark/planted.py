@@ -1,11 +1,11 @@
-"""Faults planted in a pair: does the diagnosis blame the layer that is at fault, and do its limits
-fit the pair?
+"""Faults planted in a pair of policies, to check the diagnosis and its limits.
 
     python -m tdgc.benchmark.planted
     python -m tdgc.benchmark.planted --low runs/low/policy --high runs/high/policy
 
-Prints, for each fault and family, how many failures were blamed on the right layer, and what the
-errors of tracking stay below where nothing is wrong (docs/trace.md).
+Does the diagnosis blame the layer at fault, and do its limits fit the pair? Prints, for each fault
+and family, how many failures were blamed on the right layer, and the bounds that 95 % of the
+tracking errors stay below without a fault (docs/trace.md).
 """
 
 import argparse
@@ -46,16 +46,16 @@ from tdgc.tasks.high_observation import high_layout
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
 SEED = 11  # of the tiles for faults; limits are measured on others
-EPISODES = 4  # of each fault and family
-#: Hard enough that a fault shows, easy enough that nothing else does.
+EPISODES = 4  # per fault and family
+#: Level by family: hard enough for a fault to show, easy enough that nothing else does.
 LEVELS = dict.fromkeys(FAMILIES, 6) | {"rough": 4}
 LIMIT_SEEDS, LIMIT_LEVELS, LIMIT_EPISODES = (1, 2), (6, 8), 5
-_SHARE = 95  # per cent of what succeeds, that stays below a limit
-_WEAK = 0.02  # of a motor's strength
+_SHARE = 95  # per cent of the errors in successful episodes that stay below a limit
+_WEAK = 0.02  # share of its strength that a weak motor has left
 
 
 class WeakMotor(HierarchyDriver):
-    """One motor of every robot has lost its strength; ``joint`` is one of ``JOINTS``."""
+    """One motor of every robot has lost most of its strength; ``joint`` is one of ``JOINTS``."""
 
     def __init__(self, high: Decides, config: HighLevelConfig, joint: str) -> None:
         super().__init__(high, config)
@@ -69,7 +69,7 @@ class WeakMotor(HierarchyDriver):
 
 
 class SwappedBounds(HierarchyDriver):
-    """The decoder's bounds of a command are the wrong way round."""
+    """The decoder's lower and upper bound of one command are swapped."""
 
     def __init__(self, high: Decides, config: HighLevelConfig, command: str) -> None:
         super().__init__(high, config)
@@ -78,7 +78,7 @@ class SwappedBounds(HierarchyDriver):
 
 
 class Blindfold(HierarchyDriver):
-    """The high policy sees flat ground of an unknown family and a goal where there is none."""
+    """The high policy sees flat ground of an unknown family and a goal in a random direction."""
 
     def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
         angle = np.random.default_rng(0).uniform(-np.pi, np.pi, loco.num_robots)
@@ -98,12 +98,12 @@ class Blindfold(HierarchyDriver):
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a pair.
+    """A fault to plant in a pair.
 
     Attributes:
-        name: in words.
-        layer: that is to blame, one of ``LAYERS``.
-        plant: the driver of a high policy and its MDP, with the fault.
+        name: description of the fault.
+        layer: the layer to blame, one of ``LAYERS``.
+        plant: makes the driver with the fault from a high policy and its MDP.
     """
 
     name: str
@@ -138,7 +138,7 @@ FAULTS = (
 def traced(
     driver: Driver, low: Policy, family: str, level: int, count: int, seed: int
 ) -> list[Trace]:
-    """Traces of the first ``count`` episodes of a cell."""
+    """Run the first ``count`` episodes of a cell and return their traces."""
     tracer = Tracer(driver, seed)
     run_cell(Cell("planted", "nominal", family, level, 0, count), low, driver, seed, [tracer])
     return tracer.traces()
@@ -147,21 +147,26 @@ def traced(
 def blamed(
     driver: Driver, low: Policy, family: str, level: int, count: int, hips: float
 ) -> list[str]:
-    """The layers that the failures of a cell are blamed on."""
+    """Run episodes of a cell and return the layers that the failures are blamed on."""
     traces = traced(driver, low, family, level, count, SEED)
     return [diagnose(t, hips).layer for t in traces if t.outcome != "reached"]
 
 
 def stretches(trace: Trace) -> Iterator[NDArray[np.bool_]]:
-    """An episode's intervals, (n - 1,), in stretches of ``LOOK_BACK`` s from ``SETTLE`` on."""
+    """Yield masks, (n - 1,), of an episode's intervals in successive stretches of ``LOOK_BACK`` s
+    from ``SETTLE`` on."""
     begins, end = trace["time"][:-1], trace["time"][-1]
     for start in np.arange(SETTLE, end - LOOK_BACK + 1e-6, LOOK_BACK):
         yield (begins > start - 1e-6) & (begins < start + LOOK_BACK - 1e-6)
 
 
 def measured_limits(traces: Sequence[Trace], hips: float) -> Mapping[str, tuple[float, float]]:
-    """What 95 % of the errors stay below, of stretches and of whole episodes that succeed: by the
-    names of ``LIMITS``; nan where none was to be judged."""
+    """Bounds that 95 % of the tracking errors in successful episodes stay below.
+
+    Returns:
+        The bounds for stretches and for whole episodes, keyed by the names of ``LIMITS``; nan where
+        there was no error to judge.
+    """
     errors: dict[tuple[str, bool], list[float]] = defaultdict(list)
     for trace in traces:
         clear, whole = free(trace, tile_under(trace), hips), settled(trace)

@@ -1,4 +1,4 @@
-"""Recordings: all that is needed to show an episode again, at every control step."""
+"""Recordings: everything needed to replay an episode, at every control step."""
 
 import dataclasses
 import itertools
@@ -22,15 +22,15 @@ class Recording(EpisodeRecord):
     """One episode; row i of the arrays is the robot after control step i of n.
 
     Attributes:
-        robot: what robot it was.
-        dt: s, a control step.
-        bounds: (12, 2) what its continuous commands stayed within.
-        position, quaternion, q: trunk in the tile's frame, (n, 3) m and (n, 4); joints, (n, 12)
-            rad.
+        robot: configuration of the robot.
+        dt: length of a control step in s.
+        bounds: (12, 2) bounds of the continuous commands.
+        position, quaternion: pose of the trunk in the tile's frame, (n, 3) m and (n, 4).
+        q: (n, 12) rad, joint angles.
         command: (n, 15) in force during the step.
         velocity: (n, 3) forward and left in m/s, yaw rate in rad/s, like the first commands.
         height: (n,) m, trunk above the support surface under it.
-        contact, desired: (n, 4) feet in contact, and whether the gait desired it.
+        contact, desired: (n, 4) whether each foot is in contact, and whether the gait desires it.
     """
 
     robot: RobotConfig
@@ -47,17 +47,17 @@ class Recording(EpisodeRecord):
 
     @property
     def ending(self) -> str:
-        """How and when it ended, for people."""
+        """Outcome and time of the end, as text for people."""
         return f"{self.outcome.replace('_', ' ')}, {len(self.command) * self.dt:.1f} s"
 
 
 class Recorder:
-    """A ``Watcher`` that records a cell's first episodes.
+    """A ``Watcher`` that records the first episodes of a family and level.
 
     Args:
-        driver: what drives the batch.
-        seed: of the evaluation's tiles.
-        count: episodes with a number below that are recorded.
+        driver: the driver of the batch.
+        seed: seed of the evaluation's tiles.
+        count: episodes with a number below this are recorded.
     """
 
     def __init__(self, driver: Driver, seed: int, count: int) -> None:
@@ -94,7 +94,7 @@ class Recorder:
         )
 
     def recordings(self) -> list[Recording]:
-        """The recordings of the batch that was watched last, in order."""
+        """Return the recordings of the last batch watched, in order."""
         cell, loco = self._cell, self._loco
         bounds = np.array(dataclasses.astuple(self._driver.bounds))
         result = []
@@ -116,12 +116,13 @@ class Recorder:
 
 
 def spans(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Runs of True in ``flags`` (n,), as (begin, end) with ``flags[begin:end]`` all True."""
+    """Return the runs of True in ``flags`` (n,) as (begin, end), so that ``flags[begin:end]`` are
+    all True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def stretches(values: NDArray[np.int64]) -> list[tuple[int, int, int]]:
-    """Runs of equal ``values`` (n,), as (begin, end, value) that cover all of it."""
+    """Return the runs of equal ``values`` (n,) as (begin, end, value); together they cover all."""
     cuts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
     return [(a, b, int(values[a])) for a, b in itertools.pairwise(cuts)]

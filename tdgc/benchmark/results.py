@@ -1,4 +1,4 @@
-"""Results: episodes -> tables of rates, and the files of a results folder."""
+"""Results of an evaluation: tables of rates, and the files of a results folder."""
 
 import contextlib
 import csv
@@ -15,24 +15,24 @@ from tdgc.files import atomic
 from tdgc.parallel.worker import WorkerError
 from tdgc.sim.terrain import EDITION
 
-#: Files of ``write_results``.
+#: Files written by ``write_results``.
 FILES = ("episodes.csv", "summary.json", "trajectories.npz")
-#: What may stop episodes under way: Ctrl-C, a robot that blows up, a full disk, a dead process.
+#: What may stop an evaluation: Ctrl-C, a robot that blows up, a full disk, a dead process.
 STOPS = (KeyboardInterrupt, FloatingPointError, OSError, WorkerError)
-#: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and of
-#: which edition of the benchmark the tiles are and those that the policies were trained on.
+#: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and
+#: the benchmark editions of the tiles and of the policies' training.
 PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
-# The rule of dominance (TDGC-Bench): ``tdgc`` is nowhere below ``gp``. What it has over ``cues`` is
-# what learning adds to the cues.
+# The rule of dominance (TDGC-Bench): ``tdgc`` is nowhere significantly below ``gp``. Its lead over
+# ``cues`` is what learning adds to the cues.
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
 
 
 def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, Any]:
-    """condition -> family -> ``difference`` of two policies on the same tiles, and "mean" over
-    the families.
+    """Compare two policies on the same tiles: condition -> family -> ``difference``, with "mean"
+    over the families.
 
     Raises:
-        ValueError: a tile that only one of them was on.
+        ValueError: only one of the policies was run on some tile.
     """
     reached: dict[str, dict[tuple[str, str, int, int], bool]] = {first: {}, second: {}}
     for e in episodes:
@@ -54,8 +54,8 @@ def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, A
 
 
 def sides(episodes: Iterable[Episode]) -> dict[str, Any]:
-    """policy -> family -> ``difference`` of tiles' mirror images and the tiles themselves, and
-    "mean" over the families: what a policy has learned of one side only."""
+    """Compare tiles' mirror images with the tiles themselves, which shows what a policy has learned
+    for one side only: policy -> family -> ``difference``, with "mean" over the families."""
     reached: dict[tuple[str, str, int, int], dict[str, bool]] = {}
     for e in episodes:
         if e.condition in ("mirrored", "nominal"):
@@ -77,15 +77,15 @@ def sides(episodes: Iterable[Episode]) -> dict[str, Any]:
 
 
 def success(rows: Sequence[Episode]) -> dict[str, float]:
-    """``rates`` of episodes."""
+    """Return the ``rates`` of episodes."""
     return rates([e.outcome == "reached" for e in rows])
 
 
 def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:
-    """summary.json: policy -> condition -> family -> level -> rates, and means.
+    """Build the tree of summary.json: policy -> condition -> family -> level -> ``rates``.
 
-    Beside the levels of a family stands ``"mean"`` over them, beside the families ``"mean"`` over
-    all; cells are equally large, so these are means over cells too.
+    Each family also has a ``"mean"`` over its levels, and each condition a ``"mean"`` over all its
+    episodes. Cells are equally large, so these are means over cells too.
     """
     tree: dict[str, Any] = {}
     for e in episodes:
@@ -105,8 +105,12 @@ def summarise(episodes: Iterable[Episode]) -> dict[str, Any]:
 
 
 def describe(summary: dict[str, Any]) -> str:
-    """A summary for the terminal: rates by family and level with their means, then the paired
-    differences in points of success, and where the first policy is below the second."""
+    """Format a summary for the terminal.
+
+    It lists the rates by family and level with their means, the paired differences in points of
+    success with a note where the first policy is below the second, the differences on mirrored
+    tiles, and policies that were trained on another edition of the benchmark.
+    """
     lines: list[str] = []
     for policy, conditions in policies_of(summary).items():
         for condition, families in conditions.items():
@@ -127,12 +131,12 @@ def describe(summary: dict[str, Any]) -> str:
 
 
 def policies_of(summary: dict[str, Any]) -> dict[str, Any]:
-    """The rates by policy of a ``summary``, without what stands beside them."""
+    """Return the rates by policy from a ``summary``, without its other keys."""
     return {key: value for key, value in summary.items() if key not in (PAIRED, SIDES, EDITIONS)}
 
 
 def verdict(pair: str, found: dict[str, float]) -> str:
-    """What a ``difference`` says of the rule of dominance: "below gp", or nothing to say."""
+    """Return e.g. "below gp" if a pair's ``difference`` breaks the rule of dominance, else ""."""
     return f"below {pair.rpartition(' ')[-1]}" if found["ci_high"] < 0.0 else ""
 
 
@@ -152,7 +156,7 @@ def _rates(families: dict[str, Any]) -> list[str]:
     wide = max(8, *(len(name) + 1 for name in names))
     lines = ["family".ljust(wide) + "".join(f"{level:>8}" for level in levels)]
     for name in names:
-        found = [families[name].get(level) for level in levels]  # None where it was stopped
+        found = [families[name].get(level) for level in levels]  # None where the run was stopped
         cells = "".join(f"{100 * cell['rate']:7.1f}%" if cell else f"{'-':>8}" for cell in found)
         lines.append(name.ljust(wide) + cells)
     mean = families["mean"]
@@ -164,13 +168,13 @@ def _rates(families: dict[str, Any]) -> list[str]:
 def write_results(
     folder: Path, episodes: Sequence[Episode], editions: Mapping[str, int] | None = None
 ) -> dict[str, Any]:
-    """Write episodes.csv, summary.json and trajectories.npz into ``folder``; returns the summary.
+    """Write episodes.csv, summary.json and trajectories.npz into ``folder``; return the summary.
 
-    ``editions`` are those of the benchmark that policies were trained on, by what they are called.
-    Policies that were not on the same tiles are not compared.
+    ``editions`` are the benchmark editions that the policies were trained on, keyed by "low" and
+    "high". Policies that were not run on the same tiles are not compared.
 
-    trajectories.npz holds the tracks in the order of episodes.csv: ``poses`` (N, 3), those of all
-    episodes one after another, ``counts`` (E,), how many are each one's, and ``goals`` (E, 2).
+    trajectories.npz holds the tracks in the order of episodes.csv: ``poses`` (N, 3) of all episodes
+    one after another, ``counts`` (E,), the number of poses of each episode, and ``goals`` (E, 2).
     """
     with (
         atomic(folder / "episodes.csv") as partial,
@@ -179,7 +183,7 @@ def write_results(
         writer = csv.DictWriter(file, list(episodes[0].row()))
         writer.writeheader()
         writer.writerows(e.row() for e in episodes)
-    # NumPy would append its suffix to a name.
+    # Pass an open file, because NumPy would append its suffix to a name.
     with atomic(folder / "trajectories.npz") as partial, open(partial, "wb") as tracks:
         np.savez_compressed(
             tracks,
@@ -219,14 +223,14 @@ def salvage(
     cells: Sequence[Cell],
     editions: Mapping[str, int] | None = None,
 ) -> Iterator[None]:
-    """Run episodes within it: if one of ``STOPS`` stops them, what is ``complete`` is kept.
+    """Context for running episodes that keeps what is ``complete`` if one of ``STOPS`` occurs.
 
-    The table of that is written and printed, and a note of the exception, which is raised on, says
-    how many episodes it has.
+    It then writes and prints the table of those episodes, adds a note with their number to the
+    exception, and re-raises it.
 
     Args:
         folder, editions: as for ``write_results``.
-        episodes: those that have ended; it grows meanwhile.
+        episodes: the episodes that have ended; the caller appends to it meanwhile.
         cells: all batches of the evaluation.
     """
     try:
@@ -242,7 +246,7 @@ def salvage(
 
 
 def what_stopped(error: BaseException) -> str:
-    """One line about one of ``STOPS``, with its notes."""
+    """Describe one of ``STOPS`` in one line, with its notes."""
     said = str(error).rpartition("\n")[-1]  # a cluster's errors begin with a traceback
     said = "stopped by Ctrl-C" if isinstance(error, KeyboardInterrupt) else said
     return "; ".join([said, *getattr(error, "__notes__", ())])

@@ -1,11 +1,12 @@
-"""Traces: what was decided, when, on which cues, and how it was carried out; a file an episode.
+"""Traces: what was decided, when, on which cues, and how it was carried out; one file per episode.
 
-A trace is a table with a row a decision: what the robot and its cues were like, the action, the
-commands it was decoded to, and how the decision before was carried out. A last row holds the end of
-the episode and no decision. ``COLUMNS`` lists all columns, docs/trace.md shows the list.
+A trace is a table with one row per decision: the state of the robot, the cues, the action, the
+commands it was decoded to, and how well the previous decision was carried out. A final row holds
+the end of the episode and no decision. ``COLUMNS`` defines all columns; docs/trace.md lists them.
 
-Files are Parquet with scalar columns only, readable by any tool for tables. What a column means,
-its unit and the episode stand in the file too. They need pyarrow, the extra ``trace``.
+Files are Parquet with scalar columns only, so any table tool can read them. Their metadata give
+the unit and meaning of each column and identify the episode. They need pyarrow, the extra
+``trace``.
 """
 
 import dataclasses
@@ -50,14 +51,14 @@ class TraceError(InputError):
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a trace; ``unit`` is empty for a column of names."""
+    """A column of a trace; ``unit`` is empty for a text column."""
 
     name: str
     unit: str
     meaning: str
 
 
-#: Commands that a body can be measured against; the others shape feet, contacts or power.
+#: Commands that the motion of the trunk is compared with; the others shape feet, contacts or power.
 TRACKED = ("vx", "vy", "yaw_rate", "body_height", "pitch", "roll")
 _ACTIONS = tuple(f"action_{name}" for name in (*CONTINUOUS, "gait"))
 _COMMANDS = tuple(f"command_{name}" for name in NAMES)
@@ -105,15 +106,15 @@ def _columns() -> Iterator[Column]:
         yield Column(name, "1", "term of the high policy's reward, weighted")
 
 
-#: All columns in order. Numbers are float32. A value that there is none of is null: decisions, and
-#: the probes that they look at, in the last row, looks back in the first, actions and cues of a
-#: driver that has none, reward terms without a weight.
+#: All columns in order. Numbers are float32. Missing values are null: the decision and the probes
+#: that it was based on in the last row, the columns that look back in the first row, actions and
+#: cues of a driver that has none, and reward terms without a weight.
 COLUMNS: tuple[Column, ...] = tuple(_columns())
 _TEXT = tuple(c.name for c in COLUMNS if not c.unit)
 _DECIDED = (*_PROBES, *_ACTIONS, *_COMMANDS, "asked_frequency", "gait", *_AT_BOUND)
 
 
-#: Seed and level of an episode that was on no tile: one of a real robot, say.
+#: Seed and level of an episode without a tile, for example on a real robot.
 NO_TILE = -1
 
 
@@ -122,9 +123,9 @@ class Trace(EpisodeRecord):
     """One episode's trace.
 
     Attributes:
-        columns: name -> (n,) float32, or str and None in columns of names; n - 1 decisions and the
+        columns: name -> (n,) float32, or str and None in text columns; n - 1 decisions and the
             end. NaN stands for null.
-        probes: where the policy's probes are, see ``probe_places``; empty of one that has none.
+        probes: where the policy's probes are, see ``probe_places``; empty if it has none.
     """
 
     columns: dict[str, NDArray[Any]]
@@ -135,7 +136,7 @@ class Trace(EpisodeRecord):
 
     @property
     def file_name(self) -> str:
-        """Its file's name."""
+        """Name of the trace's file."""
         return f"{self.name}.parquet"
 
 
@@ -143,15 +144,18 @@ _META = tuple(f for f in dataclasses.fields(Trace) if f.name != "columns")
 
 
 def action_columns(action: NDArray[np.floating]) -> dict[str, NDArray[Any]]:
-    """Columns of actions (n, 13)."""
+    """The columns for actions (n, 13)."""
     return dict(zip(_ACTIONS, action.T.copy(), strict=True))
 
 
 def command_columns(
     command: Array, carried_out: Array, bounds: CommandRanges
 ) -> dict[str, NDArray[Any]]:
-    """Columns of commands (n, 15) and of what was carried out of them (n, 15): the latter, the
-    gait, and which of the former are at their ``bounds``."""
+    """The columns for commands (n, 15) as requested and ``carried_out`` (n, 15).
+
+    They hold the commands carried out, the requested frequency, the gait, and which of the
+    requested commands are at their ``bounds``.
+    """
     columns: dict[str, NDArray[Any]] = dict(zip(_COMMANDS, carried_out.T.copy(), strict=True))
     columns["asked_frequency"] = command[:, INDEX["frequency"]].copy()
     columns["gait"] = np.array(GAITS, dtype=object)[gait_index(command)]
@@ -164,18 +168,20 @@ def command_columns(
 
 
 def probe_places(points: Array) -> str:
-    """Where probes (n, 2) are, in m ahead and to the left: ``0.1,0 0.15,0`` and so on."""
+    """Positions of probes (n, 2) as text, in m ahead and to the left: ``0.1,0 0.15,0`` etc."""
     return " ".join(f"{x:g},{y:g}" for x, y in points)
 
 
 def probe_columns(heights: Array) -> dict[str, NDArray[Any]]:
-    """Columns of the heights (n, 32) under the probes, m."""
+    """The columns for the heights (n, 32) under the probes, in m."""
     return dict(zip(_PROBES, heights.T, strict=True))
 
 
 def tilt(gravity: Array) -> tuple[Array, Array]:
-    """Pitch and roll, (n,) rad each, of trunks that see gravity (n, 3): what
-    ``rewards.commanded_gravity`` makes gravity of."""
+    """Pitch and roll, (n,) rad each, from gravity (n, 3) in the trunk frame.
+
+    The inverse of ``rewards.commanded_gravity``.
+    """
     x, y, z = gravity.T
     return np.arcsin(np.clip(x, -1.0, 1.0)), np.arctan2(-y, -z)
 
@@ -185,7 +191,7 @@ class Tracer:
 
     Args:
         driver: what drives the batch.
-        seed: of the evaluation's tiles.
+        seed: seed of the evaluation's tiles.
     """
 
     def __init__(self, driver: Driver, seed: int) -> None:
@@ -218,8 +224,8 @@ class Tracer:
             self._look()
 
     def traces(self) -> list[Trace]:
-        """The traces of the batch that was watched last, in order."""
-        if self._count.any():  # all ended between two decisions
+        """The traces of the most recently watched batch, in order."""
+        if self._count.any():  # the last episodes ended between two decisions
             self._look()
         cell, result, driver = self._cell, [], self._driver
         places = "" if driver.probes is None else probe_places(PROBES[driver.config.probes])
@@ -229,7 +235,7 @@ class Tracer:
             for c in COLUMNS:
                 kind = object if c.name in _TEXT else np.float32
                 columns[c.name] = np.array([row[c.name][k] for row in rows], dtype=kind)
-                if c.name in _DECIDED:  # a fellow robot's decision was noted beside its end
+                if c.name in _DECIDED:  # other robots may have decided after this one ended
                     columns[c.name][-1] = None if kind is object else np.nan
             record = cell.record(k, self._seed, self._outcome[k])
             result.append(Trace(**record, columns=columns, probes=places))
@@ -245,7 +251,7 @@ class Tracer:
         self._power, self._force = np.zeros(m), np.zeros((m, 5))
 
     def _decide(self, live: NDArray[np.intp]) -> None:
-        """Note the decision that was just taken in the row of what it was taken on."""
+        """Add the decision just taken to the latest row, which holds the state it was based on."""
         row, command, driver = self._rows[-1], self._loco.command, self._driver
         self._decisions[live] += 1
         if driver.action is not None:
@@ -259,14 +265,14 @@ class Tracer:
         self._clear()
 
     def _measure(self, live: NDArray[np.intp]) -> None:
-        """Look at a control step of the robots that are still going."""
+        """Accumulate the measurements of one control step of the ``live`` robots."""
         loco = self._loco
         state = loco.world.state
         pitch, roll = tilt(state.gravity)
         measured = np.stack(
             [*state.heading_vel[:, :2].T, state.ang_vel[:, 2], self._height(), pitch, roll], axis=1
         )
-        measured[:, 3] -= loco.robot.base_height  # the command adds to it
+        measured[:, 3] -= loco.robot.base_height  # the command is relative to it
         wanted = loco.command[:, [INDEX[name] for name in TRACKED]]
         touching = state.foot_force > CONTACT_FORCE
         self._steps[live] += 1
@@ -279,7 +285,7 @@ class Tracer:
         self._force[live] = np.maximum(self._force[live], force[live])
 
     def _look(self) -> None:
-        """A new row: what things are like now, and how the decision before was carried out."""
+        """Start a new row: the current state, and how the previous decision was carried out."""
         state, offset = self._loco.world.state, self._goal - self._loco.world.state.position[:, :2]
         nothing = np.full(self._loco.num_robots, np.nan)
         row: dict[str, NDArray[Any]] = {
@@ -299,7 +305,7 @@ class Tracer:
         self._count[:] = 0.0
 
     def _add_execution(self, row: dict[str, NDArray[Any]]) -> None:
-        count = np.where(self._count > 0.0, self._count, np.nan)  # some ended long ago
+        count = np.where(self._count > 0.0, self._count, np.nan)  # 0: has already ended
         row["seconds"] = self._dt * count
         for k, name in enumerate(TRACKED):
             row[f"error_{name}"] = self._error[:, k] / count
@@ -308,7 +314,7 @@ class Tracer:
             row[f"match_{foot}"] = self._match[:, k] / count
         row["trunk_force"], row["leg_force"] = self._force[:, 0], self._force[:, 1:].max(axis=1)
         row["power"] = self._power / count
-        # As in training, where a decision that ends early is paid for all of its time.
+        # As in training, a decision that ends early is rewarded for its full duration.
         config = self._driver.config.rewards
         share = len(self._rows) / self._horizon
         seen = high_step(
@@ -329,16 +335,16 @@ class Tracer:
 
 @dataclass(frozen=True)
 class Selection:
-    """Which traces are written: all, those that failed, or the first so many of each cell."""
+    """Which traces are written: all, those of failed episodes, or the first N of each cell."""
 
     which: Literal["all", "failed"] | int
 
     @classmethod
     def parse(cls, text: str) -> "Selection":
-        """``all``, ``failed`` or a number.
+        """Parse ``all``, ``failed`` or a number.
 
         Raises:
-            TraceError: something else.
+            TraceError: the text is none of these.
         """
         if text == "all":
             return cls("all")
@@ -346,7 +352,7 @@ class Selection:
             return cls("failed")
         if not (text.isascii() and text.isdigit() and int(text[:9]) > 0):
             raise TraceError(f"--trace must be all, failed or a number from 1, not '{text}'")
-        return cls(int(text[:9]))  # more than any evaluation has
+        return cls(int(text[:9]))  # nine digits exceed any evaluation
 
     def includes(self, trace: Trace) -> bool:
         if isinstance(self.which, int):
@@ -369,13 +375,13 @@ def _fields() -> list[tuple[str, Any, dict[str, str]]]:
 
 
 def _about(field: Any) -> dict[str, str]:
-    """Unit and description of a column in a file, as far as it has them."""
+    """Unit and description of a column in a file, where present."""
     found = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     return {key: found[key] for key in ("unit", "description") if key in found}
 
 
 def write(trace: Trace, folder: str | Path) -> Path:
-    """Write ``trace`` into ``folder`` under its ``file_name``, whole or not at all; its path.
+    """Write ``trace`` atomically into ``folder`` under its ``file_name`` and return the path.
 
     Raises:
         InputError: pyarrow is not installed.
@@ -397,7 +403,7 @@ def write(trace: Trace, folder: str | Path) -> Path:
             partial,
             compression="zstd",
             use_dictionary=list(_TEXT),
-            use_byte_stream_split=[c.name for c in COLUMNS if c.unit],  # a fifth smaller
+            use_byte_stream_split=[c.name for c in COLUMNS if c.unit],  # files a fifth smaller
             write_statistics=False,
             write_page_checksum=True,
         )
@@ -405,10 +411,11 @@ def write(trace: Trace, folder: str | Path) -> Path:
 
 
 def read(path: str | Path) -> Trace:
-    """The trace in a file that ``write`` wrote.
+    """Read the trace in a file that ``write`` wrote.
 
     Raises:
-        TraceError: no such file, one that is damaged, no trace, or of another version.
+        TraceError: the file is missing, damaged, not a trace, or of another version.
+        InputError: pyarrow is not installed.
     """
     require("a trace", ("pyarrow",), "trace")
     import pyarrow as pa
@@ -425,7 +432,7 @@ def read(path: str | Path) -> Trace:
             known = (meta.get("format"), meta.get("version"), fields)
             table = file.read() if known == (FORMAT, str(VERSION), _fields()) else None
             if table is not None:
-                table.validate(full=True)  # that its names are UTF-8, among others
+                table.validate(full=True)  # among other things, that text is UTF-8
     except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
         raise TraceError(f"{path}: damaged, or not a Parquet file") from error
     if meta.get("format") != FORMAT:

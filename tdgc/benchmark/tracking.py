@@ -1,4 +1,4 @@
-"""The low policy alone, on a plane: how it tracks commands in each gait, how often it falls."""
+"""The low policy alone on a plane: command tracking in each gait, and how often it falls."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,25 +20,27 @@ from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rewards import CONTACT_FORCE
 from tdgc.tasks.rules import is_fallen
 
-_TRACKING_SECONDS = 10.0  # an episode: one command
-_SETTLE_SECONDS = 1.0  # not counted: speeding up from rest
-_SWITCH_SECONDS = 2.0  # between gaits in the falls test
-_FALL_SHARE, _FALL_SECONDS = 0.6, 20.0  # of the episodes: 100 a gait make 20 minutes of walking
+_TRACKING_SECONDS = 10.0  # length of a tracking episode, which has one command
+_SETTLE_SECONDS = 1.0  # not scored, because robots accelerate from rest
+_SWITCH_SECONDS = 2.0  # between gait changes in the fall test
+# Robots in the fall test as a share of the episodes per gait, and how long each walks: with 100
+# episodes, 20 minutes of walking.
+_FALL_SHARE, _FALL_SECONDS = 0.6, 20.0
 
 
 def draw_commands(
     rng: np.random.Generator, ranges: CommandRanges, gait: NDArray[np.integer]
 ) -> Array:
-    """Commands of robots in these gaits (n,), the others over the full ranges, (n, 15)."""
+    """Draw commands (n, 15) with the given gaits (n,), the rest uniform over ``ranges``."""
     bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
     continuous = rng.uniform(bounds[:, 0], bounds[:, 1], (len(gait), len(CONTINUOUS)))
     return np.concatenate([continuous, gait_embedding(gait)], axis=1)
 
 
 def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Locomotion]:
-    """``m`` nominal robots that start from rest.
+    """Walk ``m`` nominal robots from rest for ``seconds``.
 
-    Yields before each control step, so that the caller may set commands and look.
+    Yields before each control step, so that the caller can set commands and inspect the state.
     """
     config = load_low(low)[1]
     loco = Locomotion(m, config.robot, config.physics, None, config.gyro)
@@ -55,10 +57,11 @@ def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Lo
 
 
 def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, float]:
-    """Tracking of one gait on the plane, commands over the full ranges.
+    """Measure tracking in one gait on the plane, with commands over the full ranges.
 
-    RMSE of the instantaneous planar velocity (heading frame) and yaw rate at every control step
-    after the first second, and the share of foot samples whose contact is the desired one.
+    Returns the RMSE of the instantaneous planar velocity (heading frame) and of the yaw rate at
+    every control step after the first second, and the share of foot samples in which contact is as
+    desired.
     """
     config, g = load_low(low)[1], GAITS.index(gait)
     rng = np.random.default_rng((EVAL_STREAM, seed, g))
@@ -82,9 +85,9 @@ def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, fl
 
 
 def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
-    """Falls while the gait switches at random every 2 s, commands over the full ranges.
+    """Count falls while the gait changes at random every 2 s, with commands over the full ranges.
 
-    A robot that falls stays out, and its time counts up to the fall.
+    A fallen robot is not restarted; its time counts up to the fall.
     """
     config = load_low(low)[1]
     m, dt = robots, config.physics.control_dt
@@ -110,7 +113,7 @@ def _run(measure: Callable[[Policy], dict[str, float]], low: Policy) -> dict[str
 def tracking(
     low: Policy, episodes: int, seed: int, workers: int, run: RunJobs = run_jobs
 ) -> dict[str, Any]:
-    """tracking.json: each gait's tracking and the falls; ``run`` is where the work is done."""
+    """Contents of tracking.json: tracking in each gait, and falls; ``run`` executes the jobs."""
     robots = max(1, round(_FALL_SHARE * episodes))
     jobs = [partial(track_gait, gait=gait, episodes=episodes, seed=seed) for gait in GAITS]
     jobs.append(partial(count_falls, robots=robots, seed=seed))

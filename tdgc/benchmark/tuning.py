@@ -1,8 +1,8 @@
 """Tuning at deployment: narrower commands, fewer gaits, another decision rate, safety limits.
 
-The commands between the two levels can be limited without any training. A bound clips a command
-and does not rescale it: an action goes on to mean what it meant to the policy, and only what lies
-beyond the bound changes. In JSON, all keys optional:
+The commands between the two levels can be limited without retraining. A bound clips a command
+rather than rescaling it, so an action keeps the meaning it had in training and only commands
+beyond the bound change. In JSON, with all keys optional:
 
     {
       "decoder": {"vx": {"low": -0.2, "high": 0.6}, "gaits": ["trot", "bound"]},
@@ -45,7 +45,7 @@ _VELOCITIES = ("vx", "vy", "yaw_rate")
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds of one command, in its unit; None leaves the policy's own."""
+    """Bounds of one command, in its unit; None keeps the policy's own bound."""
 
     low: float | None = None
     high: float | None = None
@@ -53,7 +53,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class DecoderTuning:
-    """Bounds that clip the decoder's commands, and the gaits allowed."""
+    """Bounds that clip the decoder's commands, and the allowed gaits."""
 
     vx: Limits = Limits()
     vy: Limits = Limits()
@@ -72,12 +72,12 @@ class DecoderTuning:
 
 @dataclass(frozen=True)
 class SafetyTuning:
-    """Limits that slow a robot down at every control step, after all bounds.
+    """Limits that slow a robot down, applied at every control step after all bounds.
 
     Attributes:
-        max_tilt: rad between the trunk and level ground. Tilted by more, the robot is asked for
-            max_tilt / tilt of the velocity and yaw rate.
-        max_speed: m/s. A faster planar velocity is shortened to it and keeps its direction.
+        max_tilt: angle between the trunk and the horizontal, rad. Beyond it, commanded velocity
+            and yaw rate are scaled by max_tilt / tilt.
+        max_speed: m/s. A faster planar velocity is scaled down to it and keeps its direction.
     """
 
     max_tilt: float | None = None
@@ -86,7 +86,7 @@ class SafetyTuning:
 
 @dataclass(frozen=True)
 class Tuning:
-    """What may be changed at deployment; ``decision_rate`` in Hz."""
+    """Changes to a policy at deployment; ``decision_rate`` is in Hz."""
 
     decoder: DecoderTuning = DecoderTuning()
     decision_rate: float | None = None
@@ -94,27 +94,27 @@ class Tuning:
 
 
 def load(path: str | Path | None, assignments: Iterable[str] = ()) -> Tuning:
-    """The tuning in a JSON file, with ``key=value`` strings applied on top.
+    """Load the tuning from a JSON file, with ``key=value`` strings applied on top.
 
     Raises:
-        ConfigError: a file that cannot be read or is no JSON, an unknown key or one that stands
-            twice, a value of the wrong type, NaN or infinite; the message is one line.
+        ConfigError: the file cannot be read or is not JSON, a key is unknown or duplicated, or a
+            value has the wrong type, is NaN or infinite; the message is one line.
     """
     data = {} if path is None else read_json(Path(path))
     return with_overrides(from_dict(Tuning, data), assignments)
 
 
 def tuned_ranges(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> CommandRanges:
-    """The bounds that a tuned policy's commands stay within.
+    """Bounds that a tuned policy's commands stay within.
 
     Args:
         tuning: the changes.
-        config: of the high policy that is tuned.
-        low: of the low policy, whose ``commands`` are what it was trained on.
+        config: configuration of the tuned high policy.
+        low: configuration of the low policy; its ``commands`` are the ranges it was trained on.
 
     Raises:
-        ConfigError: a bound outside what the low policy was trained on, one that is wider than the
-            policy's own, so that it would change nothing, or a lower bound above its upper one.
+        ConfigError: a bound is outside what the low policy was trained on, or wider than the high
+            policy's own, so that it would change nothing, or a lower bound is above the upper one.
     """
     ranges = {}
     for name in CONTINUOUS:
@@ -136,10 +136,10 @@ def tuned_ranges(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -
 
 
 def tuned_decimation(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> int:
-    """Control steps a decision is held.
+    """Control steps for which a decision is held.
 
     Raises:
-        ConfigError: a rate that does not divide the control rate, or less than one decision an
+        ConfigError: the rate does not divide the control rate, or gives less than one decision per
             episode.
     """
     if tuning.decision_rate is None:
@@ -159,7 +159,7 @@ def check(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> None:
     """Refuse a tuning that cannot be used with these policies, or that changes nothing.
 
     Raises:
-        ConfigError: says which key, and what is allowed.
+        ConfigError: the tuning is refused; names the key and what is allowed.
     """
     ranges, decimation = tuned_ranges(tuning, config, low), tuned_decimation(tuning, config, low)
     gaits, safety = tuning.decoder.gaits, tuning.safety
@@ -189,19 +189,19 @@ def check(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> None:
 
 
 class TunedDriver(HierarchyDriver):
-    """``HierarchyDriver`` within a tuning's limits, ``tdgc-tuned``.
+    """``HierarchyDriver`` within a tuning's limits, the policy ``tdgc-tuned``.
 
-    The policy goes on to see its own last action. Where the gait that it picks is not allowed, the
-    robot takes the allowed one that is nearest on the action's gait channel: the least change of
-    the action that is allowed.
+    The policy still observes its own last action, not the limited command. If the gait it picks is
+    not allowed, the robot uses the allowed gait that is nearest on the action's gait channel, which
+    is the smallest change of the action that gives an allowed gait.
 
     Args:
-        high, config: what ``load_high`` returned.
+        high, config: as returned by ``load_high``.
         low: the low policy's MDP.
         tuning: the limits.
 
     Raises:
-        ConfigError: limits that cannot be used, see ``check``.
+        ConfigError: the limits cannot be used, see ``check``.
     """
 
     def __init__(
@@ -229,7 +229,7 @@ class TunedDriver(HierarchyDriver):
 
     def _nearest_gait(self, action: NDArray[np.floating]) -> NDArray[np.int64]:
         chosen = self._decoder.gait(action)
-        place = 2.0 * (self._decoder.normalise(action)[:, -1:] + 1.0)  # gait i from i to i + 1
+        place = 2.0 * (self._decoder.normalise(action)[:, -1:] + 1.0)  # gait i spans i to i + 1
         away = np.maximum(self._gaits - place, place - (self._gaits + 1.0))
         nearest = self._gaits[np.argmin(away, axis=1)]
         return np.where(np.isin(chosen, self._gaits), chosen, nearest)
@@ -246,15 +246,15 @@ class TunedDriver(HierarchyDriver):
             command[:, turning] *= self._safety.max_tilt / np.maximum(tilt, self._safety.max_tilt)
 
 
-# ---------------------------------------------------------------------------- what it changed
+# ---------------------------------------------------------------------------- effect of a tuning
 
 
 def compare(episodes: Sequence[Episode], before: str, after: str) -> dict[str, Any]:
-    """Two policies on the same tiles: condition -> policy -> figures, and what changed.
+    """Compare two policies on the same tiles: condition -> policy -> figures, and what changed.
 
-    Figures are ``success`` and, over all of a policy's episodes together, ``mean_speed`` in m/s
-    along the path and ``energy_per_metre`` in J (None where nothing moved). ``gained`` counts the
-    tiles that only ``after`` reached the goal on, ``lost`` those that only ``before`` did.
+    Figures are ``success`` and, pooled over all of a policy's episodes, ``mean_speed`` in m/s along
+    the path and ``energy_per_metre`` in J (None if nothing moved). ``gained`` counts the tiles on
+    which only ``after`` reached the goal, ``lost`` those on which only ``before`` did.
     """
     result: dict[str, Any] = {}
     for condition in dict.fromkeys(e.condition for e in episodes):
@@ -274,7 +274,7 @@ def compare(episodes: Sequence[Episode], before: str, after: str) -> dict[str, A
 
 
 def record(tuning: Tuning) -> dict[str, Any]:
-    """What a tuning changes, as JSON: the keys that differ from their defaults."""
+    """The keys of a tuning that differ from their defaults, as JSON."""
 
     def changed(now: dict[str, Any], default: dict[str, Any]) -> dict[str, Any]:
         kept = {}

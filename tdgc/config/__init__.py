@@ -1,7 +1,8 @@
-"""Every number that a user may want to change, with its unit and where it comes from.
+"""Every setting that a user may want to change, with its unit and the origin of its value.
 
-Frozen dataclasses, one per section of the paper; ``tdgc.config.settings`` reads, writes and changes
-them. A setting that came later than the first policies says in its metadata what it was ``before``.
+The settings are frozen dataclasses; ``tdgc.config.settings`` reads, writes and changes them. The
+metadata of a setting that was added after the first policies were trained holds, as ``before``, the
+value that applied until then.
 """
 
 from tdgc.config.high import HighLevelConfig, HighRewardConfig

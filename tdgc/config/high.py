@@ -11,10 +11,10 @@ from tdgc.config.sim import CommandRanges, RandomisationConfig
 class HighRewardConfig:
     """Weights and constants of the high policy's reward (Sec. IV-B), one weight per term.
 
-    The paper gives the terms and no numbers, so those without an origin of their own are ours.
+    The paper gives the terms but no numbers; values without a stated origin are our own.
 
-    Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the step's
-    duration, unless ``step_time_scaling`` is off: then they are per decision.
+    Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the duration of a
+    decision. With ``step_time_scaling`` off, they are per decision.
     """
 
     step_time_scaling: bool = field(default=True, metadata={"before": True})
@@ -34,7 +34,7 @@ class HighRewardConfig:
     curve_rate: float = 3.0  # b of the goal distance
     goal_radius: Positive = 0.5  # m, d_0: the paper's reach distance
     arrive_base: float = 1.0  # b_0
-    arrive_speed: float = 2.0  # b_1: what an early arrival adds
+    arrive_speed: float = 2.0  # b_1: bonus for arriving early
     joint_speed_weight: float = 0.05  # beta of eta_t
     height_scale: Positive = 0.01  # m^2, sigma_z
     force_threshold: float = 1.0  # N, F_th
@@ -48,54 +48,54 @@ _GAITS: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = ("trot", "pronk"
 class HighLevelConfig:
     """The decision-level MDP (Sec. IV-B) and its curriculum (Sec. IV-C)."""
 
-    decimation: Count = 5  # control steps a decision: 10 Hz; 1 is the paper's synchronous loop
+    decimation: Count = 5  # control steps per decision: 10 Hz; 1 is the paper's synchronous loop
     cues: Literal["both", "semantic", "geometric", "none"] = "both"
-    # Gaits that the gait channel chooses from, in equal shares of its range.
+    # Gaits that the gait channel chooses from; each takes an equal share of the channel's range.
     gaits: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = field(
         default=_GAITS, metadata={"before": _GAITS}
     )
-    # What it decides: all commands, or the velocities and the gait. The other commands then stay at
-    # their defaults, or as near as ``commands`` lets them.
+    # What the high policy decides: all commands, or only the velocities and the gait. The remaining
+    # commands then stay at their defaults, or at the nearest value that ``commands`` allows.
     behaviour: Literal["all", "velocities"] = field(default="all", metadata={"before": "all"})
-    # What the high policy sees of the gait clock. The paper's phi is the sine alone, which in pronk
-    # does not tell feet that touch down from feet that take off.
+    # What the high policy observes of the gait clock. The paper's phi is the sine alone, which in
+    # pronk does not distinguish touch-down from lift-off.
     clock: Literal["sine", "both"] = field(default="both", metadata={"before": "sine"})
-    # Where the heights of the geometric cue are probed, see ``tdgc.tasks.probes``.
+    # Layout of the height probes of the geometric cue, see ``tdgc.tasks.probes``.
     probes: Literal["graded", "lines", "staggered"] = field(
         default="graded", metadata={"before": "staggered"}
     )
-    # Whether it is told how old the probes' heights are, as a sensor's time stamp does.
+    # Whether the age of the probe heights is observed, as from a sensor's time stamp.
     probe_age: bool = field(default=True, metadata={"before": False})
-    # Whether it sees how fast the goal came nearer since the last decision. A leap is timed by the
-    # trunk's speed, which no sensor of the robot gives (docs/experiments.md).
+    # Whether the speed of approach to the goal since the last decision is observed. A leap is timed
+    # by the trunk's speed, which no sensor on the robot measures (docs/experiments.md).
     closing_speed: bool = field(default=True, metadata={"before": False})
-    # Share of the episodes in training whose family is told as unknown, so that the probes alone
-    # have to do: tiles of several families, or of none that has a name.
+    # Share of training episodes whose family is given as unknown, so that the policy must rely on
+    # the probes alone: practice for tiles of several families, or of a family without a name.
     unknown_share: Share = 0.2
-    # Trenches, which are leapt to a few centimetres, take twice the robots of the others.
-    # Clutter stands for ground that no other family resembles, and ditches for trenches behind and
-    # before other ground (docs/experiments.md).
+    # Gap has twice the robots of any other family, since leaps must be precise to a few
+    # centimetres. Clutter stands for ground that no other family resembles, ditches for trenches
+    # before or behind other ground (docs/experiments.md).
     families: tuple[str, ...] = (
         "rough", "pillar", "stair", "gap", "gap", "tilt", "clutter", "ditches"
     )  # fmt: skip
     levels: Count = 11  # L_max: levels 0..10
-    # How levels are chosen in training: by each robot's performance, as the paper has it; drawn
+    # How levels are chosen in training: by each robot's performance, as in the paper; drawn
     # uniformly for each episode; or always the hardest.
     curriculum: Literal["performance", "uniform", "hardest"] = field(
         default="performance", metadata={"before": "performance"}
     )
-    # m: in training trenches are this deep on level 0 and deepen from there, see
-    # ``tdgc.tasks.tiles.shallow``; null: all of them are as deep as in the benchmark.
+    # m, depth of training trenches on level 0; they deepen with the level, see
+    # ``tdgc.tasks.tiles.shallow``. null: as deep as in the benchmark on every level.
     shallowest_trench: Positive | None = field(default=None, metadata={"before": None})
-    window: Count = 4  # W episodes: few, since one of every robot takes minutes on two cores
-    threshold: Count = 3  # S successes of them
-    # Robots begin spread over ``first_levels`` levels, of which ``first_level`` is the lowest.
+    window: Count = 4  # W episodes: few, since one per robot takes minutes on two cores
+    threshold: Count = 3  # S successes among them
+    # Robots start spread over ``first_levels`` levels, the lowest of which is ``first_level``.
     first_level: Whole = field(default=0, metadata={"before": 0})
     first_levels: Count = 1
     episode_seconds: Positive = 20.0  # T_max (benchmark)
-    hold_seconds: NotNegative = 2.0  # an episode goes on that long after the goal was reached
+    hold_seconds: NotNegative = 2.0  # s for which an episode continues after the goal is reached
     action_limit: Positive = 1.0  # a_max of the decoder
-    # The decoder's bounds; all that the low policy was trained on where there are none.
+    # Bounds of the decoder; null: the ranges that the low policy was trained on.
     commands: CommandRanges | None = None
     rewards: HighRewardConfig = field(default_factory=HighRewardConfig)
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)

@@ -1,6 +1,7 @@
-"""Configurations to and from JSON, and ``--set key=value``: dataclasses with checked values.
+"""Reading, writing and changing configurations: dataclasses with checked values.
 
-``with_overrides`` applies ``key=value`` pairs, ``to_dict`` and ``from_dict`` go to and from JSON.
+``with_overrides`` applies ``key=value`` pairs (``--set``), ``to_dict`` and ``from_dict`` convert to
+and from JSON.
 Unknown keys, values of the wrong type and values outside the allowed range raise ``ConfigError``.
 """
 
@@ -16,7 +17,7 @@ from typing import Any, Literal, TypeVar
 
 from tdgc.errors import InputError
 
-#: Types of settings: what a value must be beside of that type stands in the error message.
+#: Types of settings. The annotation is the constraint on a value, as worded in error messages.
 Range = typing.Annotated[tuple[float, float], "[low, high] with low <= high"]
 PositiveRange = typing.Annotated[tuple[float, float], "[low, high] with 0 < low <= high"]
 Share = typing.Annotated[float, "from 0 to 1"]
@@ -24,7 +25,7 @@ Positive = typing.Annotated[float, "above 0"]
 NotNegative = typing.Annotated[float, "at least 0"]
 Whole = typing.Annotated[int, "at least 0"]
 Count = typing.Annotated[int, "at least 1"]
-#: Of trot, pronk, pace and bound.
+#: Shares of trot, pronk, pace and bound.
 GaitShares = typing.Annotated[tuple[Share, Share, Share, Share], "shares that add up to 1"]
 
 _HOLDS: dict[Any, Callable[[Any], bool]] = {
@@ -47,15 +48,15 @@ Config = TypeVar("Config")
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Nested plain dict of a configuration, ready for JSON (tuples become lists)."""
+    """Convert a configuration to nested plain dicts, ready for JSON (tuples become lists)."""
     return typing.cast(dict[str, Any], json.loads(json.dumps(dataclasses.asdict(config))))
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds.
+    """Read a JSON file.
 
     Raises:
-        ConfigError: a file that cannot be read or is no JSON, or a key that stands twice.
+        ConfigError: the file cannot be read or is not JSON, or a key appears twice.
     """
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -80,7 +81,7 @@ def from_dict(cls: type[Config], data: Mapping[str, Any], where: str = "") -> Co
     """Build ``cls`` from a plain dict; missing keys keep their defaults.
 
     Raises:
-        ConfigError: a key that ``cls`` does not have, or a value of the wrong type.
+        ConfigError: a key that ``cls`` does not have, or a value that its setting does not allow.
     """
     if not isinstance(data, Mapping):
         shown = reprlib.repr(data)
@@ -97,12 +98,14 @@ def from_dict(cls: type[Config], data: Mapping[str, Any], where: str = "") -> Co
 
 
 def recorded(cls: type[Config], data: Mapping[str, Any], source: object) -> Config:
-    """Build ``cls`` from what a policy or a run has written down, which must name every key.
+    """Build ``cls`` from the configuration stored with a policy or a run.
 
-    What was trained with one value must not be run with today's default of a key that came later.
+    Every key must be there, except that settings with a ``before`` in their metadata take that
+    value. Otherwise a policy could run with today's default of a key that did not exist when it
+    was trained.
 
     Raises:
-        ConfigError: as ``from_dict``, or a key that is missing; the message begins with ``source``.
+        ConfigError: as ``from_dict``, or a key is missing; the message begins with ``source``.
     """
     try:
         config = from_dict(cls, _with_before(cls, data))
@@ -114,7 +117,7 @@ def recorded(cls: type[Config], data: Mapping[str, Any], source: object) -> Conf
 
 
 def _with_before(cls: Any, data: Any) -> Any:
-    """``data``, and for each setting of ``cls`` that came later what it was before."""
+    """``data``, completed with the ``before`` values of those settings of ``cls`` that it lacks."""
     if not isinstance(data, Mapping):
         return data
     filled = dict(data)
@@ -141,7 +144,8 @@ def with_overrides(config: Config, assignments: Iterable[str]) -> Config:
     """Apply ``dotted.key=value`` strings, values written as in JSON (bare words are strings).
 
     Raises:
-        ConfigError: an assignment without ``=``, an unknown key, or a value of the wrong type.
+        ConfigError: an assignment without ``=``, an unknown key, or a value that its setting does
+            not allow.
     """
     for text in assignments:
         key, equals, raw = text.partition("=")
@@ -162,14 +166,14 @@ def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
         raise ConfigError(f"unknown configuration key '{full}'; allowed: {', '.join(names)}")
     child = getattr(config, head)
     if rest:
-        if child is None:  # a table that may be left out
+        if child is None:  # an optional table
             options = typing.get_args(typing.get_type_hints(type(config))[head])
             table = next((o for o in options if dataclasses.is_dataclass(o)), None)
             child = None if table is None else typing.cast(type, table)()
         if not dataclasses.is_dataclass(child):
             raise ConfigError(f"'{full}': '{head}' is a value, it has no keys of its own")
         return dataclasses.replace(config, **{head: _replace(child, rest, value, full)})
-    if dataclasses.is_dataclass(child) and isinstance(value, dict):  # its other keys stay
+    if dataclasses.is_dataclass(child) and isinstance(value, dict):  # other keys are kept
         for key, own in value.items():
             child = _replace(child, [key], own, f"{full}.{key}")
         return dataclasses.replace(config, **{head: child})
@@ -178,9 +182,9 @@ def _replace(config: Any, path: list[str], value: Any, full: str) -> Any:
 
 
 def _coerce(hint: Any, value: Any, path: str) -> Any:
-    """``value`` as the annotated type: the few that configurations use, and nothing else."""
+    """Convert ``value`` to the annotated type; only types that configurations use are supported."""
     origin = typing.get_origin(hint)
-    shown = reprlib.repr(value)  # short, whatever the file holds
+    shown = reprlib.repr(value)  # short, whatever the file contains
     if origin is typing.Annotated:
         kind, rule = typing.get_args(hint)
         checked = _coerce(kind, value, path)
@@ -215,7 +219,7 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         try:
             number = float(value)
-        except OverflowError:  # a whole number beyond the largest float
+        except OverflowError:  # an integer beyond the largest float
             number = math.inf
         if not math.isfinite(number):
             raise ConfigError(f"'{path}' must be a finite number, not {shown}")

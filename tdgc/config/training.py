@@ -1,4 +1,4 @@
-"""Runs of train_low.py and train_high.py."""
+"""Settings of a run of train_low.py or train_high.py."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -12,11 +12,12 @@ from tdgc.config.settings import Count, NotNegative, Positive, Share, Whole
 class PPOConfig:
     """PPO and the networks of the low policy; see docs/experiments.md for what was compared."""
 
-    # Times the mean standard deviation of the actions: as exploration shrinks, the same step of the
-    # mean moves the policy further (the clipped share rose from 0.2 to 0.4 at a constant rate).
+    # Multiplied by the mean standard deviation of the actions: as exploration shrinks, the same
+    # step of the mean changes the policy more (at a constant rate the clipped share rose from 0.2
+    # to 0.4).
     learning_rate: Positive = 6e-4
     final_learning_rate: Positive = 1e-5  # reached linearly at the last step
-    n_steps: Count = 32  # control steps a robot between updates
+    n_steps: Count = 32  # control steps per robot between updates
     batch_size: Count = 960  # a quarter of a rollout
     n_epochs: Count = 5
     gamma: Share = 0.99
@@ -26,7 +27,7 @@ class PPOConfig:
     vf_coef: NotNegative = 0.5
     max_grad_norm: Positive = 1.0
     initial_std: Positive = 1.0
-    # SB3's 1e-5 swallows the critic's gradients: rewards carry dt and are below 0.03 a step.
+    # SB3's 1e-5 swamps the critic's gradients: rewards are scaled by dt and below 0.03 per step.
     adam_eps: Positive = 1e-8
     actor: tuple[Count, ...] = (256, 192)
     critic: tuple[Count, ...] = (256, 128)
@@ -36,10 +37,10 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """Calibration of the low policy (``tdgc.calibration``), the end of a run of train_low.py."""
+    """Calibration of the low policy (``tdgc.calibration``), the last phase of train_low.py."""
 
-    robots: Whole = 4800  # that walk to be measured; 0 leaves the policy as it is
-    turns: Count = 60  # of 60 control steps each, in which the copy learns
+    robots: Whole = 4800  # whose walking is measured; 0 leaves the policy as it is
+    turns: Count = 60  # rounds of distillation, of 60 control steps each
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,9 @@ class LowTrainConfig:
     seed: Whole = 42  # the paper's
     n_envs: Count = 120
     workers: Count = 2
-    steps: Count = 36_000_000  # of reinforcement learning, altogether
-    # Of the robots, on the plane, where a step costs less than half of one on a tile; the others
-    # cross tiles.
+    steps: Count = 36_000_000  # control steps of reinforcement learning, over all robots
+    # Of the robots, on the plane, where a step costs less than half as much as on a tile; the
+    # others are on tiles.
     plane_share: Share = 0.6
     log_steps: Count = 100_000
     checkpoint_seconds: NotNegative = 30.0  # with the update under way, less than a minute is lost
@@ -64,13 +65,16 @@ class LowTrainConfig:
 
 @dataclass(frozen=True)
 class RecurrentPPOConfig:
-    """RecurrentPPO and the networks of the high policy: the paper's table but for the first two."""
+    """RecurrentPPO and the networks of the high policy.
 
-    # With a deviation of 0.1 in all actions two fifths of the samples were clipped above 3e-4, and
-    # the less noise, the sooner.
+    From ``n_steps`` to ``max_grad_norm``, values are those of the paper's table.
+    """
+
+    # With a standard deviation of 0.1 in all actions, two fifths of the samples were clipped at
+    # rates above 3e-4; with less noise, this happens at lower rates.
     learning_rate: Positive = 1.5e-4
     final_learning_rate: Positive = 5e-5  # reached linearly at the last step
-    n_steps: Count = 24  # decisions a robot between updates
+    n_steps: Count = 24  # decisions per robot between updates
     minibatches: Count = 4
     n_epochs: Count = 5
     gamma: Share = 0.99
@@ -79,27 +83,28 @@ class RecurrentPPOConfig:
     ent_coef: NotNegative = 1e-4
     vf_coef: NotNegative = 0.5
     max_grad_norm: Positive = 0.5
-    # On tiles of Gap a teacher whose timing is exact reached 91 % of its goals; with this noise 88,
-    # with 0.1 in all other actions 79, and with 0.1 in the gait, too, 57 %: a gait is 0.5 wide, so
-    # that it changes once in a hundred decisions, and a leap in another gait ends in the trench.
+    # On tiles of Gap a teacher with exact timing reached 91 % of its goals; with the noise of these
+    # two settings 88 %, with 0.1 in all actions but the gait 79 %, and with 0.1 in the gait alone
+    # 57 %. A gait's interval is 0.5 wide, so at 0.1 one decision in a hundred falls into another
+    # gait, and a leap in another gait ends in the trench.
     initial_std: Positive = 0.06
-    initial_gait_std: Positive = 0.04  # of the gait channel: changes none
-    # Decisions that the noise of the gait channel is held for, within an episode: what a gait is
-    # worth shows in a second, not in a tenth of one.
+    initial_gait_std: Positive = 0.04  # of the gait channel: too small to change the gait
+    # Decisions for which the noise of the gait channel is held, within an episode: the worth of a
+    # gait shows in a second, not in a tenth of one.
     gait_hold: Count = field(default=1, metadata={"before": 1})
-    # Bonus on the entropy of the gait alone, which falls linearly to nothing at the last step.
+    # Weight of a bonus on the entropy of the gait alone; it falls linearly to 0 at the last step.
     gait_ent_coef: NotNegative = field(default=0.0, metadata={"before": 0.0})
-    # Weight of the imitation's loss beside PPO's, where imitation came first.
+    # Weight of the imitation loss added to PPO's, in runs that begin with imitation.
     imitation_coef: NotNegative = field(default=10.0, metadata={"before": 0.0})
-    # Of the robots that are not told their family, the share whose memories change places after
-    # each rollout, 2.4 s: on ground that changes a policy then acts on what it sees. On ``mixed``
-    # it was worth 6 to 9 points (docs/experiments.md).
+    # Share of the robots that are not told their family whose hidden states are exchanged after
+    # each rollout (2.4 s): where the ground changes, the policy then acts on what it observes. On
+    # ``mixed`` this gained 6 to 9 points (docs/experiments.md).
     memory_exchange: Share = field(default=0.5, metadata={"before": 0.0})
-    # Units of both LSTMs; null for a feed-forward policy. With 128 units each an update takes twice
-    # as long, and what is learned is no better.
+    # Units of each of the two LSTMs; null for a feed-forward policy. With 128 units an update takes
+    # twice as long, and the policy is no better.
     lstm: Count | None = 64
-    # Layers before either LSTM, whose output goes past it, too. Students of leaps reached 42 % of
-    # their goals without, and 59 % with a layer of 128 units (docs/experiments.md).
+    # Units of the layers before each LSTM; their output also bypasses it. Students of leaps reached
+    # 42 % of their goals without, and 59 % with a layer of 128 units (docs/experiments.md).
     encoder: tuple[Count, ...] = field(default=(128,), metadata={"before": ()})
     mirror: bool = True  # policy and value exactly left-right symmetric
     actor: tuple[Count, ...] = (64,)
@@ -108,28 +113,29 @@ class RecurrentPPOConfig:
 
 @dataclass(frozen=True)
 class ImitationConfig:
-    """Imitation of the scripted teacher, with which a run of train_high.py begins."""
+    """Imitation of the scripted teacher, the first phase of train_high.py."""
 
-    steps: Whole = 640_000  # decisions altogether; 0 leaves everything to reinforcement learning
+    steps: Whole = 640_000  # decisions over all robots; 0 for reinforcement learning alone
     learning_rate: Positive = 2e-3
-    final_learning_rate: Positive = 2e-4  # reached linearly at the last of the steps
-    # Of each rollout 48 updates of half as many decisions. How little a frequency costs more than
-    # the teacher's depends on the updates that there were: 0.19, 0.15 and 0.12 after 1, 4 and 10
-    # thousand of them on the same 90,000 decisions (docs/experiments.md).
+    final_learning_rate: Positive = 2e-4  # reached linearly at the last of these steps
+    # With two minibatches, 48 updates per rollout, each on half as many decisions as the rollout
+    # has. The excess cost of the student's step frequencies over the teacher's falls with the
+    # number of updates: 0.19, 0.15 and 0.12 after 1, 4 and 10 thousand of them on the same 90,000
+    # decisions (docs/experiments.md).
     n_epochs: Count = 24
     minibatches: Count = field(default=2, metadata={"before": 4})
-    # Rollouts that it learns from, each minibatch from all of them. Of the newest alone students
-    # learned strides at a price of 0.20, of the last 20 in two thirds of the time at one of 0.16
-    # (docs/experiments.md).
+    # Rollouts to learn from; each minibatch samples all of them. From the newest alone students
+    # learned strides with a price of 0.20, from the last 20, in two thirds of the time, with one of
+    # 0.16 (docs/experiments.md).
     kept: Count = field(default=40, metadata={"before": 1})
-    # How levels are chosen meanwhile, as ``env.curriculum`` has it afterwards: what the teacher
-    # shows needs no easy beginning, and the hardest levels are where a student has most to learn.
+    # How levels are chosen during imitation; ``env.curriculum`` applies afterwards. Learning from a
+    # teacher needs no easy start, and a student has most to learn on the hardest levels.
     curriculum: Literal["performance", "uniform", "hardest"] = field(
         default="uniform", metadata={"before": "performance"}
     )
-    # The levels that reinforcement learning begins on: those that robots are on when imitation
-    # ends, or the hardest for all, from where their performance takes them down within 0.15 M
-    # decisions; up from those kept takes 0.4 M.
+    # Levels at which reinforcement learning starts: those of the robots at the end of imitation, or
+    # the hardest for all. From the hardest, robots settle on their own levels within 0.15 M
+    # decisions; climbing from the kept ones takes 0.4 M.
     levels_after: Literal["kept", "hardest"] = field(default="hardest", metadata={"before": "kept"})
 
 
@@ -140,23 +146,25 @@ class HighTrainConfig:
     seed: Whole = 42
     n_envs: Count = 100
     workers: Count = 2
-    steps: Count = 2_100_000  # decisions altogether: under 80 minutes on two cores
+    steps: Count = 2_100_000  # decisions over all robots: under 80 minutes on two cores
     log_steps: Count = 24_000
     checkpoint_seconds: NotNegative = 30.0  # with the update under way, less than a minute is lost
-    start_speed: float = 0.5  # m/s: before any training it walks straight on in the default gait
-    # m, of its feet then; 0.08 is the default of Walk These Ways.
+    start_speed: float = 0.5  # m/s: the untrained policy walks straight ahead in the default gait
+    # m, swing height of the untrained policy; 0.08 is the default of Walk These Ways.
     start_swing: NotNegative = field(default=0.08, metadata={"before": 0.08})
-    # The low policy: by default what train_low.py left in runs/low, or else the shipped one.
+    # Path of the low policy; null: that of a finished train_low.py run in runs/low, or else the
+    # shipped one.
     low: str | None = None
-    # SHA-256 of its .json, where that of its weights stands, too: a run goes on with no other.
+    # SHA-256 of the low policy's .json file, which holds the checksum of its weights. A resumed run
+    # refuses any other low policy.
     low_sha256: str | None = field(default=None, metadata={"before": None})
     env: HighLevelConfig = field(default_factory=HighLevelConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     ppo: RecurrentPPOConfig = field(default_factory=RecurrentPPOConfig)
 
 
-#: ``train_high.py --preset``: assignments before those of the flags. ``paper`` is the paper's
-#: hyperparameter table and its synchronous loop.
+#: ``train_high.py --preset``: assignments applied before those of the flags. ``paper`` is the
+#: paper's hyperparameter table and its synchronous loop.
 PRESETS: dict[str, tuple[str, ...]] = {
     "default": (),
     "paper": (
@@ -187,8 +195,8 @@ PRESETS: dict[str, tuple[str, ...]] = {
     ),
 }
 
-#: ``train_high.py --no-teacher``: what reinforcement learning alone needs. Its noise has to find
-#: what the teacher would have shown.
+#: ``train_high.py --no-teacher``: what reinforcement learning alone needs. Its noise has to
+#: discover what the teacher would have demonstrated.
 NO_TEACHER: tuple[str, ...] = (
     "imitation.steps=0",
     "ppo.initial_std=0.3",
@@ -196,16 +204,16 @@ NO_TEACHER: tuple[str, ...] = (
     "ppo.learning_rate=5e-4",
     "ppo.memory_exchange=0",
     "env.unknown_share=0",
-    # With feet at 0.08 m it reached 67 % of the goals on Stair, with feet as high as gp's 98.5 %.
+    # With feet at 0.08 m it reached 67 % of the goals on Stair, with feet as high as gp's, 98.5 %.
     "start_swing=0.19",
-    # Standing at the start must not pay. With distances as shares of the tile's 8 m it is worth
-    # more than walking on once 0.086 falls a second are to be expected, and the untrained policy
-    # has 0.08; as shares of the distance between start and goal, from 0.24 on.
+    # Standing at the start must not pay. If distances are shares of the tile's 8 m, standing is
+    # worth more than walking on from an expected 0.086 falls per second, and the untrained policy
+    # has 0.08; if they are shares of the distance between start and goal, from 0.24.
     "env.rewards.map_radius=6.5",
-    # A trench of 60 cm ends whatever is tried at it.
+    # A trench 60 cm deep ends every attempt to cross it.
     "env.shallowest_trench=0.05",
-    # A second of a gait shows what it is worth. A bonus of the size that PPO takes for discrete
-    # actions keeps the gaits that easy levels do not need until hard ones do.
+    # A second of a gait shows what it is worth. An entropy bonus as large as PPO's usual one for
+    # discrete actions preserves gaits that easy levels do not need until hard levels do.
     "ppo.gait_hold=10",
     "ppo.gait_ent_coef=0.01",
 )

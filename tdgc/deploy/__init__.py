@@ -1,1 +1,1 @@
-"""The exported pair as a robot runs it, from the exported folder alone."""
+"""The exported pair of policies, run as on a robot: from the exported folder alone."""

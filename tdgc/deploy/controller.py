@@ -1,7 +1,7 @@
-"""The exported pair as a robot runs it, from nothing but the folder that ``tdgc.export`` wrote.
+"""The exported pair, run as on a robot: from nothing but the folder that ``tdgc.export`` wrote.
 
-The export's check does so in Bullet, ``tdgc.mujoco`` in MuJoCo, and a robot's own program has to do
-the same (docs/deploy.md).
+The check after export runs it in Bullet and ``tdgc.mujoco`` in MuJoCo; a robot's own program must
+do the same (docs/deploy.md).
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import NUM_JOINTS, Array, RobotState, nominal_height, nominal_pose
 from tdgc.sim.urdf import JOINTS
 
-#: Formats of graphs and the suffixes of their files.
+#: Graph formats and their file suffixes.
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
 GRAPHS = ("low", "high")
 
@@ -32,18 +32,19 @@ class Graph:
     """A graph and its interface file, run on one thread as a robot would run it.
 
     Args:
-        folder: that ``tdgc.export`` wrote.
-        name: low or high.
-        form: of ``FORMATS``.
+        folder: folder that ``tdgc.export`` wrote.
+        name: "low" or "high".
+        form: one of ``FORMATS``.
 
     Raises:
-        ExportError: an interface or a graph that cannot be used, or one that fits not the other.
+        ExportError: the interface or the graph cannot be used, or they do not match.
+        ConfigError: the interface file is missing or not JSON.
 
     Attributes:
-        table: the interface file.
-        memory: values of the inputs that come from the step before, by name.
+        table: contents of the interface file.
+        memory: values for the inputs that are carried over from the previous step, by name.
         values: all inputs and outputs of the last step, by name.
-        seconds: CPU time of the last step, which is its latency on a core of its own.
+        seconds: CPU time of the last step, which is its latency on a dedicated core.
     """
 
     def __init__(self, folder: Path, name: str, form: str) -> None:
@@ -61,12 +62,12 @@ class Graph:
         self.memory, self.values, self.seconds = dict(self._start), dict[str, Array](), 0.0
 
     def __call__(self, values: dict[str, Array]) -> dict[str, Array]:
-        """One step, inputs by name -> outputs by name; what else ``values`` holds does not matter.
+        """Run one step, inputs by name -> outputs by name; ignore other entries of ``values``.
 
-        Inputs that come from the step before are in ``memory`` if not given.
+        Inputs that are not given are taken from ``memory``.
 
         Raises:
-            ExportError: an input that is neither given nor in ``memory``.
+            ExportError: an input is neither given nor in ``memory``.
         """
         known = self.memory | values
         try:
@@ -85,10 +86,11 @@ class Graph:
 
 
 def graph_file(folder: Path, table: Table, form: str) -> Path:
-    """The file of a graph, seen to be the one that its interface file was written with.
+    """Path of a graph's file, after checking that its interface file was written with it.
 
     Raises:
-        ExportError: none of this format, or it is missing, or another one.
+        ExportError: the graph was not exported in this format, or the file is missing, cannot be
+            read or has another checksum.
     """
     files = table["files"]
     if form not in files:
@@ -109,7 +111,7 @@ def graph_file(folder: Path, table: Table, form: str) -> Path:
 
 
 def _start(signal: Table) -> Array:
-    """What an input is in the first step."""
+    """Value of an input in the first step of an episode."""
     return np.broadcast_to(np.array(signal["start"], dtype=np.float64), signal["shape"]).copy()
 
 
@@ -120,12 +122,13 @@ def _open_onnx(path: Path, table: Table) -> Run:
     options.intra_op_num_threads = 1
     try:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its classes have no common one of their own
+    except Exception as error:  # its exceptions share no base class of their own
         raise ExportError(f"{path}: no ONNX graph") from error
     for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
         if [(s["name"], s["shape"]) for s in table[side]] != [(x.name, x.shape) for x in found]:
             raise ExportError(f"{path}: its {side} are not those of its interface file")
-    # The graph reads and writes these arrays: naming and wrapping new ones takes a sixth of a step.
+    # The session is bound to these arrays, since naming and wrapping new ones takes a sixth of a
+    # step.
     binding = session.io_binding()
     given, made = ([np.zeros(s["shape"]) for s in table[side]] for side in ("inputs", "outputs"))
     for signal, array in zip(table["inputs"], given, strict=True):
@@ -167,8 +170,7 @@ _RUNTIMES = {"onnx": _open_onnx, "torchscript": _open_torchscript}
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Without what exporters and loaders say of themselves: deprecations, operators of
-    torchvision."""
+    """Suppress warnings of exporters and loaders, about deprecations or torchvision operators."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         logging.disable(logging.WARNING)
@@ -183,25 +185,26 @@ def quiet() -> Iterator[None]:
 
 
 class Controller:
-    """Both graphs of a folder, run in the order and with the memory that the interface says.
+    """Both graphs of a folder, run in the order and with the memory that the interface specifies.
 
     Args:
-        folder: that ``tdgc.export`` wrote.
-        form: of ``FORMATS``.
+        folder: folder that ``tdgc.export`` wrote.
+        form: one of ``FORMATS``.
 
     Raises:
-        ExportError: a folder that cannot be used.
+        ExportError: the folder cannot be used.
+        ConfigError: an interface file is missing or not JSON.
 
     Attributes:
-        low, high: the graphs; ``table`` of each is its interface file.
-        dt: s, a control step.
+        low, high: the graphs; ``table`` of each holds its interface file.
+        dt: length of a control step, s.
         decimation: control steps per decision.
-        horizon: control steps of an episode.
-        bounds: of the continuous commands.
+        horizon: control steps per episode.
+        bounds: bounds of the continuous commands.
         count: control steps since ``reset``.
         commands: (15,) in force in the last step.
-        decided: whether ``high`` was run in the last step.
-        seconds: CPU time in the graphs in the last step.
+        decided: whether ``high`` ran in the last step.
+        seconds: CPU time spent in the graphs in the last step.
     """
 
     def __init__(self, folder: Path, form: str = "onnx") -> None:
@@ -230,7 +233,7 @@ class Controller:
         self.reset()
 
     def reset(self, clock: float | None = None) -> None:
-        """Begin a new episode, with the gait clock at ``clock`` or where the interface says."""
+        """Begin a new episode, with the gait clock at ``clock`` or as the interface specifies."""
         for graph in self._graphs.values():
             graph.reset()
         if clock is not None:
@@ -242,19 +245,21 @@ class Controller:
     def sense(
         self, state: RobotState, goal: Array, family: str, ground: Callable[[Array, Array], Array]
     ) -> dict[str, Array]:
-        """What the sensors and the map of a simulated robot say: inputs of the graphs by name, and
-        its heading ``yaw``, which logs may have.
+        """Sensor and map readings of a simulated robot: graph inputs by name, and ``yaw``.
+
+        No graph takes the heading ``yaw``; it is there for logs.
 
         Args:
-            state: of one robot.
+            state: state of one robot.
             goal: (2,) m in the world.
-            family: of the tile; one that has no name here is told as the interface says.
-            ground: heights in m of points (x, y) in the world; off its map, as at the nearest
-                border.
+            family: terrain family of the tile; one that the interface does not list is replaced by
+                the interface's ``otherwise``.
+            ground: ground heights in m at points (x, y) in the world; off the map, the height at
+                the nearest border.
         """
         rotation, position, yaw = state.rotation[0], state.position[0], float(state.yaw[0])
         ahead, left = np.cos(yaw), np.sin(yaw)
-        heading = np.array([[ahead, left], [-left, ahead]])  # world to the frame turned by yaw
+        heading = np.array([[ahead, left], [-left, ahead]])  # world -> heading frame
         points = position[:2] + self._places @ heading
         plane = position[2] - self._probes["plane_below_trunk"]["value"]
         families = self.high.table["families"]
@@ -272,9 +277,10 @@ class Controller:
         }
 
     def step(self, readings: dict[str, Array]) -> Array:
-        """One control step: sensors and map by name, as from ``sense`` -> joint targets, (12,) rad.
+        """Run one control step: readings by name, as from ``sense`` -> joint targets, (12,) rad.
 
-        After the goal and after the horizon it stands as the interface says.
+        ``high`` stops running ``keep_deciding`` seconds after the goal is reached, or at the
+        horizon. From then on ``low`` gets the interface's commands ``stand``.
         """
         task, elapsed, since = self._task, self.count * self.dt, 0.0
         if np.linalg.norm(readings["goal"]) < task["goal_radius"]["value"]:
@@ -305,12 +311,13 @@ class Controller:
     # ------------------------------------------------------------------ the robot
 
     def robot(self, urdf: Path | None = None) -> RobotConfig:
-        """The robot of the interface for this package's own simulation; its ``urdf`` is the copy in
-        the folder by default.
+        """The robot that the interface describes, as a configuration for this package's simulation.
+
+        ``urdf`` defaults to the copy in the folder.
 
         Raises:
-            ConfigError: a URDF that this package cannot read.
-            ExportError: a URDF of another robot, or joints that differ from leg to leg.
+            ConfigError: this package cannot read the URDF.
+            ExportError: the URDF is of another robot, or joint settings differ from leg to leg.
         """
         table = self.low.table
         urdf = urdf or self._folder / table["robot"]["urdf"]["file"]
@@ -342,7 +349,11 @@ class Controller:
         return config
 
     def _compare(self, config: RobotConfig, urdf: Path) -> None:
-        """See that a URDF is of the robot that was exported."""
+        """Check that a URDF describes the exported robot.
+
+        Raises:
+            ExportError: joint limits, masses, start height or checksum differ.
+        """
         geometry, table = read_geometry(config), self.low.table
         limits = table["joint_control"]["joint_limits"]
         told = np.column_stack([limits["low"], limits["high"]])

@@ -1,9 +1,9 @@
-"""The two graphs of an export as PyTorch modules: what stands between sensors and joint targets.
+"""The two graphs of an export as PyTorch modules: everything between sensors and joint targets.
 
-A graph holds a policy and all that the simulator does around it: observation (Sec. IV-A, IV-B),
+A graph holds a policy and all that the simulator computes around it: observation (Sec. IV-A, IV-B),
 decoder, phase clock and joint targets. All inputs and outputs are vectors of float64. The networks
-run in float32, as they were trained; what surrounds them runs in float64, as in the simulator: a
-clock in float32 would drift away.
+run in float32, as they were trained. Everything around them runs in float64, as in the simulator,
+because a clock in float32 would drift.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,7 +45,7 @@ from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE
 
 
 def _constant(value: ArrayLike) -> Tensor:
-    # A tensor, since the ONNX exporter rounds Python's floats to float32.
+    # A tensor, because the ONNX exporter rounds Python floats to float32.
     return th.tensor(np.asarray(value, dtype=np.float64))
 
 
@@ -53,7 +53,7 @@ _TURN, _HALF_TURN, _HALF = _constant(2.0 * np.pi), _constant(np.pi), _constant(0
 
 
 class Row:
-    """Rows of a network's inputs, in the order and scales of ``layout``."""
+    """Builds a network's input rows, in the order and scales of ``layout``."""
 
     def __init__(self, layout: Sequence[Term[Any]]) -> None:
         self._names = [term.name for term in layout]
@@ -61,7 +61,7 @@ class Row:
         self._scale = _constant(np.concatenate(scales))
 
     def __call__(self, terms: Mapping[str, Tensor]) -> Tensor:
-        """Terms by name, in the units that they are read in -> (n,) float32."""
+        """Terms by name, unscaled -> (n,) float32."""
         return (self._scale * th.cat([terms[name] for name in self._names])).float()
 
 
@@ -70,14 +70,15 @@ class Signal:
     """An input or output of a graph: a vector of float64.
 
     Attributes:
-        name: as in the graph.
+        name: its name in the graph.
         size: length of the vector.
-        unit: of its entries; None where the table ``order`` gives each entry's.
+        unit: unit of the entries; None if the table ``order`` gives one for each entry.
         meaning: what it is.
         order: the table in the interface file that names the entries.
-        previous: of an input, the input or output whose value of the step before it takes.
-        start: of an input, what it (or each entry) is in the first step of an episode.
-        source: of an input, the output of the other graph whose latest value it takes.
+        previous: for an input, the input or output of the same graph whose value in the previous
+            step it takes.
+        start: for an input, the value of it (or of each entry) in the first step of an episode.
+        source: for an input, the output of the other graph whose latest value it takes.
     """
 
     name: str
@@ -99,7 +100,7 @@ _GYRO = Signal("gyro", 3, "rad/s", "angular velocity about the trunk's axes: ahe
 
 
 class ClippedActor(nn.Module):
-    """The mean action of a policy as ``Policy.predict`` clips it, after the LSTM if any."""
+    """The mean action of a policy, clipped as in ``Policy.predict``; after the LSTM if any."""
 
     def __init__(self, policy: Policy) -> None:
         super().__init__()
@@ -107,7 +108,7 @@ class ClippedActor(nn.Module):
         self.low, self.high = th.from_numpy(policy.low), th.from_numpy(policy.high)
 
     def forward(self, x: Tensor) -> Tensor:
-        """What the policy's ``actor`` takes for one robot -> (action_dim,), both float32."""
+        """Input of the policy's ``actor`` for one robot -> (action_dim,), both float32."""
         return th.as_tensor(self.actor(x)[0]).clamp(self.low, self.high)
 
 
@@ -120,7 +121,7 @@ def by_command(command: Tensor) -> Commands:
 
 
 def foot_phases(clock: Tensor, command: Commands) -> Tensor:
-    """Warped phase of each foot, as ``gaits.foot_phases``: (1,) or (n, 1) -> (4,) or (n, 4)."""
+    """Warped phase of each foot, as in ``gaits.foot_phases``: (1,) or (n, 1) -> (4,) or (n, 4)."""
     phase, offset, bound, duty = (command[name] for name in (*NAMES[12:], "duration"))
     raw = clock + th.cat([phase + offset + bound, offset, bound, phase])
     raw = raw - raw.floor()
@@ -129,11 +130,12 @@ def foot_phases(clock: Tensor, command: Commands) -> Tensor:
 
 
 class Pose(nn.Module):
-    """q0, as ``Locomotion.pose``.
+    """q0, as in ``Locomotion.pose``.
 
     Attributes:
-        ahead: (n, 1) s ahead of the clock, where phases of the feet are needed: now; to walk, also
-            the middle of the control step and when joints reach their targets.
+        ahead: (n, 1) s, times ahead of the clock at which foot phases are needed: now and, for a
+            pose that walks, the middle of the control step and the time at which joints reach
+            their targets.
     """
 
     def __init__(self, robot: RobotConfig, control_dt: float) -> None:
@@ -151,8 +153,8 @@ class Pose(nn.Module):
         hips = np.pad(geometry.hips, ((0, 0), (0, 1)))
         default = dict(zip(NAMES, default_command(), strict=True))
         self.hips_x, self.hips_y = map(_constant, geometry.hips.T)
-        # Feet without what the commands add, against the trunk to walk, which turns with them, or
-        # else against their hips.
+        # Feet without the contribution of the commands: relative to the trunk for a pose that
+        # walks, because commands pitch and roll the trunk, otherwise relative to their hips.
         x, y, z = (standing[0] if self.walks else standing[0] - hips).T
         self.x = _constant(x - 0.5 * default["stance_length"] * FRONT)
         self.y = _constant(y - 0.5 * default["stance_width"] * SIDE)
@@ -162,7 +164,7 @@ class Pose(nn.Module):
         self.front, self.side = _constant(0.5 * FRONT), _constant(0.5 * SIDE)
         self.out = _constant(geometry.abduction * SIDE)
         self.lowest, self.highest = map(_constant, geometry.joint_limits[2::3].T)
-        # A leg's peak load, as in ``robot.stance_load``, times its duty factor over the stiffness.
+        # A leg's peak load in ``robot.stance_load``, times the duty factor, divided by kp.
         weight = GRAVITY * sum(geometry.masses.values())
         self.load = _constant(0.125 * np.pi * weight / robot.kp)
 
@@ -170,13 +172,14 @@ class Pose(nn.Module):
         """Joint angles (12,) rad.
 
         Args:
-            phases: (n, 4) of the feet, at ``ahead``.
-            grown: (1,) share of the swing that is asked so far, as in ``PhaseClock.swing``.
+            phases: (n, 4) foot phases at the times ``ahead``.
+            grown: share of swing and foot travel applied so far in this gait, as
+                ``PhaseClock.begun``; (1,), or a scalar 1 without a ramp.
             command: the commands in force.
         """
         if not self.follows:
             return self.nominal
-        # Rows of the four feet, (1, 4), here and below.
+        # One row of four feet, (1, 4), here and below.
         through = 2.0 * phases[-1:] - 1.0
         swing = through.clamp(0.0, 1.0)
         raised = grown * (command["swing_height"] - self.default_swing) * th.sin(_HALF_TURN * swing)
@@ -193,12 +196,12 @@ class Pose(nn.Module):
     def _walk(
         self, x: Tensor, y: Tensor, z: Tensor, lead: Tensor, phases: Tensor, command: Commands
     ) -> Tensor:
-        """As ``robot.walking_pose``: (3, 4) rad.
+        """Joint angles (3, 4) rad, as ``robot.walking_pose``.
 
         Args:
-            x, y, z: (1, 4) m, feet against the trunk.
-            lead: (1, 4) s that the feet are ahead of the middle of their stance.
-            phases: (1, 4) in the middle of the control step.
+            x, y, z: (1, 4) m, feet relative to the trunk.
+            lead: (1, 4) s by which the feet are ahead of their mid-stance positions.
+            phases: (1, 4) foot phases in the middle of the control step.
             command: the commands in force.
         """
         turn = command["yaw_rate"]
@@ -209,7 +212,7 @@ class Pose(nn.Module):
         cos, sin = th.cos(roll), th.sin(roll)
         y, z = cos * y + sin * z, cos * z - sin * y
         hip, thigh, calf = self._angles(x - self.hips_x, y - self.hips_y, z)
-        # What the load on the feet does to the joints, as ``robot.load_torque``.
+        # Joint deflection under the load on the feet: ``robot.load_torque`` divided by kp.
         load = (self.load / command["duration"]) * th.sin(_TURN * phases).clamp(min=0.0)
         bends = th.cat([thigh, thigh + calf])
         ahead, down = self.lengths * th.sin(bends), (self.lengths * th.cos(bends)).sum(0)
@@ -221,14 +224,16 @@ class Pose(nn.Module):
         return th.cat([hip, thigh, calf]) - load * rises
 
     def _angles(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Angles of hips, thighs and calves in rad, as ``robot.leg_angles``, from feet in m against
-        their hips."""
+        """Hip, thigh and calf angles in rad from feet in m relative to their hips.
+
+        As ``robot.leg_angles``.
+        """
         z = z.clamp(max=HIGHEST_FOOT)
         out, upper, lower = self.out, self.thigh, self.calf
         down = (y * y + z * z - out * out).clamp(min=0.0).sqrt()
         square = x * x + down * down
         bend = (square - (upper * upper + lower * lower)) / (2.0 * upper * lower)
-        # ONNX Runtime has inverse functions of float32 alone, and no arctan2.
+        # ONNX Runtime has inverse trigonometric functions in float32 only, and no arctan2.
         calf = (-th.acos(bend.clamp(-1.0, 1.0).float())).double()
         calf = calf.clamp(self.lowest, self.highest)
         lean = lower * th.sin(calf) / (upper + lower * th.cos(calf))
@@ -241,7 +246,7 @@ class LowGraph(nn.Module):
     """One control step of the low policy (Sec. IV-A): sensors and commands to joint targets.
 
     Attributes:
-        inputs, outputs: what ``forward`` takes and gives, in order.
+        inputs, outputs: signals that ``forward`` takes and returns, in order.
     """
 
     def __init__(self, policy: Policy, config: LowLevelConfig) -> None:
@@ -263,11 +268,11 @@ class LowGraph(nn.Module):
         self.joint_scale = _constant(action_scale(robot))
         lowest, highest = target_limits(robot, read_geometry(robot))
         self.lowest, self.highest = _constant(lowest), _constant(highest)
-        # This map is affine, so its values at 0 and at 1 say all.
+        # This map is affine, so its values at 0 and 1 determine it.
         zero = observed_command(np.zeros(NUM_COMMANDS))
         self.command_zero = _constant(zero)
         self.command_gain = _constant(observed_command(np.ones(NUM_COMMANDS)) - zero)
-        # The index of a gait is affine in its embedding, as there are four of them.
+        # With four gaits, the gait index is an affine function of the three-value embedding.
         known = np.column_stack([np.ones(len(GAITS)), GAIT_TABLE])
         first, *gain = np.linalg.solve(known, np.arange(len(GAITS)) / (len(GAITS) - 1))
         self.gait_zero, self.gait_gain = _constant([first]), _constant(gain)
@@ -338,10 +343,10 @@ class LowGraph(nn.Module):
 
 
 class HighGraph(nn.Module):
-    """One decision (Sec. IV-B): goal, cues and sensors to the 15 commands.
+    """One decision of the high policy (Sec. IV-B): goal, cues and sensors to the 15 commands.
 
     Attributes:
-        inputs, outputs: what ``forward`` takes and gives, in order.
+        inputs, outputs: signals that ``forward`` takes and returns, in order.
     """
 
     def __init__(self, policy: Policy, config: HighLevelConfig, low: LowLevelConfig) -> None:
@@ -439,7 +444,7 @@ class HighGraph(nn.Module):
         return decision.clamp(-self.limit, self.limit) / self.limit
 
     def _decode(self, decision: Tensor) -> Tensor:
-        """As ``CommandDecoder.decode``: (13,) -> (15,)."""
+        """Decode as ``CommandDecoder.decode``: (13,) -> (15,)."""
         x = self._normalise(decision)
         n = len(self.embedding)
         gait = (0.5 * n * (x[-1] + 1.0)).floor().clamp(0, n - 1).long()

@@ -1,4 +1,4 @@
-"""Interface files: all that a program needs to know of an exported pair, in fields with units.
+"""Interface files: all that a program needs to know about an exported pair, in fields with units.
 
 ``tdgc.export`` writes one for each graph; ``interface.schema.json`` describes every field.
 """
@@ -12,7 +12,7 @@ from typing import Any
 from tdgc.config import read_json
 from tdgc.errors import InputError
 
-#: Of the interface files; any change of what they hold is a new one.
+#: Version of the interface files; any change to their contents gets a new one.
 VERSION = 3
 SCHEMA = Path(__file__).with_name("interface.schema.json")
 
@@ -24,16 +24,16 @@ class ExportError(InputError):
 
 
 def interface_path(folder: Path, name: str) -> Path:
-    """Where the interface file of the graph ``name`` is."""
+    """Path of the interface file of the graph ``name``."""
     return folder / f"{name}_interface.json"
 
 
 def read_interface(folder: Path, name: str) -> Table:
-    """The interface file of the graph ``name`` in an exported folder.
+    """Read the interface file of the graph ``name`` in an exported folder.
 
     Raises:
-        ExportError: of another version, or one that lacks a field or has a wrong one.
-        ConfigError: no such file, or no JSON.
+        ExportError: the file has another version, or lacks a field or has an invalid one.
+        ConfigError: the file cannot be read or is not JSON.
     """
     from jsonschema.exceptions import best_match
 

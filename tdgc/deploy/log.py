@@ -1,10 +1,10 @@
-"""Logs of a deployed pair: what went into its graphs and what came out, step by step.
+"""Logs of a deployed pair: the inputs and outputs of its graphs, step by step.
 
-A log has a row per control step, from the first of an episode on, and a last row with what was
-sensed after the last step. It is what a real robot can write down. A trace can be made of it,
-without what only a simulator knows, and diagnosed: ``tdgc.diagnose``. A file is ``.npz``, with an
-array (rows, size) per value, or ``.csv``, with a column per entry, ``gravity_0``. docs/deploy.md
-lists the values.
+A log has one row per control step, starting with the first of an episode, and a final row with the
+readings after the last step. It holds only what a real robot can record. ``tdgc.diagnose`` turns it
+into a trace, without what only a simulator knows, and diagnoses that. A file is an ``.npz`` with
+one array (rows, size) per value, or a ``.csv`` with one column per entry, such as ``gravity_0``.
+docs/deploy.md lists the values.
 """
 
 import csv
@@ -34,13 +34,14 @@ from tdgc.sim.terrain import file_label
 
 SENSED = ("gravity", "joint_angles", "joint_speeds", "goal")  # in every row
 GIVEN = ("clock", "commands", "joint_targets")  # in every row but the last
-# Where ``high`` decided, and empty (NaN) in other rows.
+# In rows in which ``high`` decided; empty (NaN) in the others.
 DECIDED = ("family", "probes", "probe_age", "decision")
-#: What a log may lack if no graph takes it: angular velocity, and the heading in rad on the map
-#: that has the goal. Without both, velocity and yaw rate are not known; the gyro alone drifts.
+#: Sizes of the values that a log may omit if no graph takes them: angular velocity, and the heading
+#: in rad in the map frame of the goal. With neither, velocity and yaw rate are unknown; a
+#: heading from the gyro alone drifts.
 OPTIONAL = {"gyro": 3, "yaw": 1}
-ENDS = ("reached", "fell", "collided", "timeout")  # of an episode on no tile
-_SAME = 1e-3  # rad: targets written with four digits are not off by as much
+ENDS = ("reached", "fell", "collided", "timeout")  # of an episode without a tile
+_SAME = 1e-3  # rad: targets written with four digits differ by less
 
 
 class LogError(InputError):
@@ -52,9 +53,9 @@ class Log:
     """A log of one episode.
 
     Attributes:
-        name: of its file, without suffix.
+        name: its file name without the suffix.
         time: (n,) s since the start of the episode.
-        values: name -> (n, size); NaN where there is none.
+        values: name -> (n, size); NaN where there is no value.
         decisions: (k,) rows in which ``high`` decided.
     """
 
@@ -65,7 +66,7 @@ class Log:
 
 
 def layout(controller: Controller) -> dict[str, int]:
-    """Name and size of each value beside ``time``."""
+    """Name and size of each value except ``time``."""
     tables = controller.low.table, controller.high.table
     sizes = {s["name"]: s["shape"][0] for t in tables for s in (*t["inputs"], *t["outputs"])}
     sizes |= OPTIONAL
@@ -73,10 +74,10 @@ def layout(controller: Controller) -> dict[str, int]:
 
 
 class LogWriter:
-    """Writes down what a controller is fed and gives.
+    """Records the inputs and outputs of a controller.
 
     Args:
-        controller: whose steps they are.
+        controller: the controller whose steps are logged.
     """
 
     def __init__(self, controller: Controller) -> None:
@@ -84,7 +85,7 @@ class LogWriter:
         self._rows: list[dict[str, Array]] = []
 
     def add(self, readings: dict[str, Array]) -> None:
-        """Note the step that the controller just took on ``readings``."""
+        """Record the step that the controller has just taken on ``readings``."""
         low, high = self._controller.low.values, self._controller.high.values
         row = readings | {name: low[name] for name in GIVEN}
         if self._controller.decided:
@@ -94,19 +95,19 @@ class LogWriter:
         self._note(row, self._controller.count - 1)
 
     def end(self, readings: dict[str, Array]) -> None:
-        """Note ``readings`` after the last step."""
+        """Record the ``readings`` after the last step."""
         self._note(readings, self._controller.count)
 
     def _note(self, row: dict[str, Array], step: int) -> None:
-        # Copies: a simulator may go on in the same arrays.
+        # Copies, because a simulator may reuse its arrays.
         whole = {n: np.array(row.get(n, [np.nan] * k)) for n, k in self._layout.items()}
         self._rows.append(whole | {"time": np.array(step * self._controller.dt)})
 
     def save(self, path: Path) -> None:
-        """Write all into an ``.npz``.
+        """Write all rows to an ``.npz`` file.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         columns = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
         np.savez_compressed(path, allow_pickle=False, **columns)
@@ -116,10 +117,10 @@ class LogWriter:
 
 
 def read(path: Path, controller: Controller) -> Log:
-    """The log in a file, of a robot that the controller's folder was on.
+    """Read the log of a robot that ran the controller's folder.
 
     Raises:
-        LogError: no such file, one that is damaged or lacks values or rows, or values that are no
+        LogError: the file is missing or damaged, lacks values or rows, or has values that are not
             numbers.
     """
     known = {"time", *layout(controller)}
@@ -127,7 +128,7 @@ def read(path: Path, controller: Controller) -> Log:
         table = _read_csv(path, known) if path.suffix == ".csv" else _read_npz(path)
     except LogError:
         raise
-    except Exception as error:  # numpy and zipfile raise all kinds of them on damaged files
+    except Exception as error:  # numpy and zipfile raise all kinds of errors on damaged files
         raise LogError(f"{path}: missing, or neither an .npz nor a .csv of numbers") from error
     taken = [signal["name"] for signal in controller.low.table["inputs"]]
     left_out = [name for name in OPTIONAL if name not in table and name not in taken]
@@ -150,17 +151,18 @@ def read(path: Path, controller: Controller) -> Log:
 
 
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Values by name."""
+    """Read values by name."""
     with np.load(path) as file:
         return dict(file)
 
 
 def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
-    """Values by name, of those ``known``, in the order of the numbers in the columns' names; an
-    empty cell is NaN.
+    """Read the ``known`` values by name, entries in the order of their column numbers.
+
+    An empty cell is NaN.
 
     Raises:
-        LogError: the same column twice, or none for a number.
+        LogError: a column is duplicated, or a column number is skipped.
     """
     with open(path, newline="", encoding="utf-8") as file:
         header, *lines = csv.reader(file)
@@ -170,7 +172,7 @@ def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
     for place, column in enumerate(header):
         name, _, number = column.rpartition("_")
         if not (number.isascii() and number.isdigit()):
-            name, number = column, "0"  # of a single value, as the time is
+            name, number = column, "0"  # a value with a single entry, such as the time
         if name not in known:
             continue
         mine = places.setdefault(name, {})
@@ -187,7 +189,7 @@ def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
 
 
 def _gap(log: Log, controller: Controller) -> str | None:
-    """What a log lacks first, if anything."""
+    """Describe a gap in a log; None if there is none."""
     time, dt, every = log.time, controller.dt, controller.decimation
     if len(time) < 2 or not np.isfinite(time).all():
         return "needs two rows at least, each with its time"
@@ -214,12 +216,13 @@ def _gap(log: Log, controller: Controller) -> str | None:
 
 
 def replay(log: Log, controller: Controller) -> tuple[float, float]:
-    """Feed what a log says was sensed to the graphs.
+    """Replay the readings of a log through the graphs.
 
     Returns:
-        Largest difference in rad between the joint targets in the log and those of the graphs, and
-        when in s it was first too large for rounding, infinite if never. There a value was not
-        handed on from step to step as the interface says, or the graphs are other ones.
+        The largest difference in rad between the joint targets in the log and those of the graphs,
+        and the time in s at which a difference first exceeds rounding, infinite if none does. From
+        that time on, a value was not passed from step to step as the interface specifies, or the
+        robot ran other graphs.
     """
     controller.reset(float(log.values["clock"][0, 0]))
     largest, first = 0.0, np.inf
@@ -230,14 +233,18 @@ def replay(log: Log, controller: Controller) -> tuple[float, float]:
     return largest, first
 
 
-# ---------------------------------------------------------------------------- a trace
+# ---------------------------------------------------------------------------- trace
 
 
 def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
-    """How the episode of a log ended; ``told`` by who was there, one of ``ENDS``.
+    """How the episode of a log ended.
+
+    ``told`` is the outcome that an observer gave, one of ``ENDS``; it is overridden if the log
+    reaches the goal.
 
     Raises:
-        LogError: neither does the log say nor was it told, or both say something else.
+        LogError: the log does not show how the episode ended and ``told`` is None, or ``told`` is
+            "reached" but the log never reaches the goal.
     """
     goals, task = log.values["goal"], controller.high.table["task"]
     distance = np.linalg.norm(goals, axis=1)
@@ -258,13 +265,14 @@ def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
 def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
     """The trace of a log, without what only a simulator knows.
 
-    Velocity is how the goal moved as seen from the robot, whose heading is known. What follows the
-    last decision by more than its interval, standing at the goal, is no part of the trace.
+    Velocity is computed from the heading and from the motion of the goal as seen from the robot.
+    The trace ends one decision interval after the last decision; the standing at the goal that
+    follows is left out.
 
     Args:
-        log: of one episode.
-        controller: of the folder that was on the robot.
-        told: how the episode ended, where the log does not say.
+        log: log of one episode.
+        controller: controller of the folder that the robot ran.
+        told: how the episode ended, if the log does not show it.
 
     Raises:
         LogError: see ``outcome``.
@@ -295,8 +303,8 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
     )
     command = seen["commands"][begin]
     fill(slice(-1), action_columns(seen["decision"][begin]))
-    # A gait may begin faster than asked: how far the clock went, which nobody knows (NaN) of a
-    # decision whose first step was the last of all.
+    # A gait may start faster than requested, so the frequency carried out is the clock's advance in
+    # the first step of the decision. It is unknown (NaN) if that step was the last of the log.
     carried_out = command.copy()
     went = np.append(np.mod(np.diff(seen["clock"][:-1, 0]), 1.0), [np.nan] * 2)
     carried_out[:, INDEX["frequency"]] = went[begin] / controller.dt
@@ -320,7 +328,7 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
     if yaw is not None:
         turned = yaw[end] - yaw[begin]
         goal = seen["goal"][:, 0] + 1j * seen["goal"][:, 1]  # ahead + i left
-        # How the goal moved, in the heading of the middle.
+        # How the goal moved relative to the robot, in the heading halfway through the turn.
         way = goal[begin] * np.exp(-0.5j * turned) - goal[end] * np.exp(0.5j * turned)
         for name, change in (("vx", way.real), ("vy", way.imag), ("yaw_rate", turned)):
             errors[f"error_{name}"] = change / seconds - command[:, INDEX[name]]
@@ -339,8 +347,10 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
 
 
 def _heading(log: Log) -> Array | None:
-    """Heading at each row, (n,) rad from anywhere on: measured, or else what the gyro adds up to;
-    None without either."""
+    """Heading at each row up to a constant, (n,) rad: measured, or else integrated from the gyro.
+
+    None without either.
+    """
     if "yaw" in log.values:
         return np.unwrap(log.values["yaw"][:, 0])
     if "gyro" not in log.values:

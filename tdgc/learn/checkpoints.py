@@ -1,8 +1,8 @@
-"""Checkpoints: a run between two updates, to go on from as if it had not been stopped.
+"""Checkpoints: the state of a run between two updates, to resume from as if it had never stopped.
 
 A checkpoint is a folder with ``state.safetensors`` (parameters, optimiser, LSTM states, the
 workers' arrays) and ``state.json`` (counters, random states, the rest of the workers' states, and a
-checksum of all of it). No file can run code.
+checksum over both files). Loading a checkpoint cannot execute code.
 """
 
 import hashlib
@@ -27,9 +27,9 @@ from tdgc import __version__
 from tdgc.errors import InputError
 from tdgc.state import State, join, split
 
-_KEEP = 2  # checkpoints: the newest, and one before it should that be damaged
-_VERSION = 10  # since the teacher says a second way around pillars
-#: Names of what the recurrent learner remembers of the episodes under way.
+_KEEP = 2  # checkpoints: the newest, and the one before in case that is damaged
+_VERSION = 10  # since the teacher also labels the second way around pillars
+#: Tensor names of the recurrent learner's LSTM states in the current episodes.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
 
@@ -39,12 +39,12 @@ class CheckpointError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """The learner's whole state and that of its workers.
+    """The complete state of the learner and its workers.
 
     Attributes:
         tensors: by name.
-        header: all that is no tensor: ``num_timesteps``, ``n_updates``, ``random``, and what the
-            run adds, ``workers``, ``phase`` and ``seconds`` of wall time.
+        header: everything that is not a tensor: ``num_timesteps``, ``n_updates``, ``random``, and
+            what the run adds: ``workers``, ``phase`` and ``seconds`` of wall time.
     """
 
     tensors: dict[str, th.Tensor]
@@ -57,7 +57,7 @@ class Checkpoint:
 
     @classmethod
     def take(cls, model: BaseAlgorithm, extra: dict[str, Any]) -> "Checkpoint":
-        """Of a learner between two updates, and of ``extra``."""
+        """Take a checkpoint of a learner between two updates, together with ``extra``."""
         tensors = {f"policy.{k}": v for k, v in model.policy.state_dict().items()}
         optimiser = model.policy.optimizer.state_dict()
         for index, slots in optimiser["state"].items():
@@ -85,7 +85,7 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path: Path) -> "Checkpoint":
-        """From its folder.
+        """Read a checkpoint from its folder.
 
         Raises:
             CheckpointError: missing, damaged or foreign files.
@@ -109,10 +109,10 @@ class Checkpoint:
 
     @classmethod
     def newest(cls, run: Path, warn: Callable[[str], None]) -> "Checkpoint":
-        """The newest of a run that can be read; damaged ones are passed over with a warning.
+        """Read the newest readable checkpoint of a run, skipping others with a warning.
 
         Raises:
-            CheckpointError: the run has none.
+            CheckpointError: the run has no readable checkpoint.
         """
         for path in sorted((run / "checkpoints").glob("step-*"), reverse=True):
             try:
@@ -122,13 +122,13 @@ class Checkpoint:
         raise CheckpointError(f"{run}: no checkpoint that can be read")
 
     def save(self, folder: Path) -> Path:
-        """Write it; a reader sees it complete or not at all.
+        """Write the checkpoint to ``folder`` atomically and delete all but the newest two.
 
         Raises:
-            OSError: it cannot be written; those before it are left as they are.
+            OSError: it cannot be written; earlier checkpoints are left as they are.
         """
         data = safetensors.torch.save({k: v.contiguous() for k, v in self.tensors.items()})
-        header = json.loads(json.dumps(self.header))  # as a reader will have it
+        header = json.loads(json.dumps(self.header))  # as a reader will parse it
         text = json.dumps({**header, "sha256": _checksum(data, header)})
         final = folder / f"step-{self.steps:012d}"
         partial = folder / f".{final.name}.partial"
@@ -143,17 +143,19 @@ class Checkpoint:
             shutil.rmtree(final, ignore_errors=True)
             os.replace(partial, final)
         except OSError:
-            shutil.rmtree(partial, ignore_errors=True)  # it may be what fills the disk
+            shutil.rmtree(partial, ignore_errors=True)  # it may be what filled the disk
             raise
         for old in sorted(folder.glob("step-*"))[:-_KEEP]:
             shutil.rmtree(old)
         return final
 
     def restore(self, model: BaseAlgorithm) -> None:
-        """Put parameters, optimiser, counters and random states into ``model``.
+        """Restore ``model`` and the global random states.
+
+        This covers parameters, optimiser, counters, LSTM states and the notebook of rollouts.
 
         Raises:
-            CheckpointError: parameters of another shape or name.
+            CheckpointError: parameters with different names or shapes.
         """
         tensors = self.tensors
         try:
@@ -182,14 +184,14 @@ class Checkpoint:
         _restore_random(tensors, self.header["random"])
 
     def workers(self) -> list[State]:
-        """The workers' states, see ``TaskVecEnv.load_state_dicts``."""
+        """The workers' states, for ``TaskVecEnv.load_state_dicts``."""
         arrays = {k: v.numpy() for k, v in self.tensors.items() if k.startswith("extra.")}
         states: list[State] = join(self.header["workers"], arrays)
         return states
 
 
 def _checksum(data: bytes, header: dict[str, Any]) -> str:
-    """Of the tensors' file and of all that stands beside it in the header."""
+    """SHA-256 over the tensor file and all other entries of the header."""
     rest = {key: value for key, value in header.items() if key != "sha256"}
     return hashlib.sha256(data + json.dumps(rest, sort_keys=True).encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""The flags of both trainers, and the configuration that follows from them."""
+"""Command-line flags shared by both trainers, and the configuration built from them."""
 
 import argparse
 from pathlib import Path
@@ -13,8 +13,14 @@ from tdgc.parallel.worker import MakeLink, ProcessLink
 
 
 def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, unit: str) -> None:
-    """The flags of both trainers; ``out`` is the default run folder, ``config`` says what else is
-    default, and ``unit`` what a step of the run is."""
+    """Add the flags of both trainers.
+
+    Args:
+        parser: to add them to.
+        out: default run folder.
+        config: source of all other defaults.
+        unit: what ``--steps`` counts, for the help text.
+    """
     default = to_dict(config)
     training = parser.add_argument_group("training")
     training.add_argument("--steps", type=int, help=f"{unit} altogether ({default['steps']})")
@@ -46,13 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, uni
 
 
 def configure(config: Config, args: argparse.Namespace) -> Config:
-    """Configuration of the run: the folder's when resuming, else ``config``, then the flags.
+    """Build the run's configuration: the stored one when resuming, else ``config``, then the flags.
 
-    With ``--cluster`` this process joins it.
+    With ``--cluster`` this process joins the cluster.
 
     Raises:
-        ConfigError: nothing to resume, a folder in use, or a flag that cannot be used.
-        ClusterError: a cluster that cannot be used, or has fewer CPUs than there are workers.
+        ConfigError: nothing to resume, a run folder already in use, or an invalid flag.
+        ClusterError: the cluster cannot be used, or has fewer CPUs than there are workers.
     """
     stored = args.out / "config.json"
     if not args.worker_timeout > 0.0:
@@ -76,7 +82,7 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     given = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
     config = with_overrides(config, [*given, *args.assignments])
     cores = usable_cores() if args.cluster is None else connect(args.cluster)
-    if args.workers == "auto" and not args.resume:  # a run goes on with as many as it began with
+    if args.workers == "auto" and not args.resume:  # a resumed run keeps its number of workers
         workers = auto_workers(to_dict(config)["n_envs"], cores)
         config = with_overrides(config, [f"workers={workers}"])
     workers = to_dict(config)["workers"]
@@ -86,10 +92,10 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
 
 
 def check_device(name: str) -> None:
-    """See that PyTorch has the device; SB3 would take the CPU for a GPU that is not there.
+    """Check that PyTorch has the device, because SB3 falls back to the CPU if a GPU is missing.
 
     Raises:
-        ConfigError: it has not.
+        ConfigError: the device is unknown or missing.
     """
     try:
         kind = "cpu" if name == "auto" else th.device(name).type
@@ -100,5 +106,5 @@ def check_device(name: str) -> None:
 
 
 def worker_link(args: argparse.Namespace) -> MakeLink:
-    """What starts a worker: a process of this machine, or with ``--cluster`` an actor of Ray."""
+    """How workers are started: as local processes, or with ``--cluster`` as Ray actors."""
     return ProcessLink if args.cluster is None else ActorLink

@@ -1,14 +1,19 @@
 """Imitation of the scripted teacher, before reinforcement learning takes over.
 
-The apprentice acts, the teacher says at every decision what it would have done, and the recurrent
-policy learns to say so from its own observations: DAgger (Ross et al. 2011), with a teacher that
-knows more than its student (Chen et al. 2019, "Learning by cheating"). Of a leap the teacher says
-what each step frequency with each stance length would cost, and the policy learns the cheapest
-(Ross and Bagnell 2014, AggreVaTe): with the teacher's choice itself as the only target it learned a
-mean of two ways over a trench, which leads into it. For the same reason the teacher says both ways
-around a pillar, and what counts is the error to the nearer one: the mean of both stands still in
-front of it. The critic learns what these episodes return, so that PPO goes on with a critic that
-knows the policy.
+The apprentice acts, the teacher labels every decision with what it would have done, and the
+recurrent policy learns to predict these labels from its own observations. This is DAgger (Ross et
+al. 2011), with a teacher that knows more than its student (Chen et al. 2019, "Learning by
+cheating"). The teacher itself drives a share of the episodes that falls to zero over the first part
+of the imitation, see ``NavigationTask``.
+
+For a leap the teacher also gives the cost of each step frequency with each stance length, and the
+policy learns to choose the cheapest (Ross and Bagnell 2014, AggreVaTe). With the teacher's own
+choice as the only target, it learned the mean of two ways over a trench, which leads into the
+trench. For the same reason the teacher labels both ways around a pillar, and only the error to the
+nearer one counts: a policy that learns their mean stands still in front of the pillar.
+
+The critic learns the returns of these episodes, so that PPO continues with a critic that knows the
+policy.
 """
 
 from collections import deque
@@ -28,20 +33,25 @@ from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 from tdgc.tasks.teacher import WAY
 
 _STRIDE = [INDEX["frequency"], INDEX["stance_length"]]
-# As in the comparisons of docs/experiments.md: what a price weighs against a squared error in the
-# action, what is left of that error of a stride that has a price, and what a decision whose stride
-# has one weighs against others: an error in it leads into a trench, elsewhere most are forgiven.
+# Weights, as in the comparisons of docs/experiments.md: of a stride's price against a squared error
+# in the action; of the squared error of a stride that has a price; and of a decision whose stride
+# has a price against other decisions. An error in such a decision leads into a trench, whereas most
+# errors elsewhere are forgiven.
 _PRICE_WEIGHT, _PRICED, _LEAP_WEIGHT = 10.0, 0.1, 4.0
-# What a metre more on the second way around weighs against a squared error: much less than taking
-# neither, which is 1 or more, as the ways are 1 m/s and more apart in ranges of 1.2 and 2.2 m/s.
+# Weight of each extra metre of the second way around against a squared error. A detour then costs
+# much less than taking neither way, which costs 1 or more because the ways are at least 1 m/s apart
+# in ranges of 1.2 and 2.2 m/s.
 _DEARER = 1.0
-_NOTES = "notebook."  # what names in a checkpoint begin with
+_NOTES = "notebook."  # prefix of the names in a checkpoint
 
 
 class TaughtPolicy(FastRecurrentPolicy):
-    """``FastRecurrentPolicy`` on observations that the teacher's guidance follows, unseen.
+    """``FastRecurrentPolicy`` whose observations end with the teacher's guidance.
+
+    Only the loss uses the guidance; the networks do not see it.
 
     Attributes:
+        seen: width of the observation without the guidance.
         imitation_weight: of ``imitation_loss`` against the entropy, in reinforcement learning.
     """
 
@@ -52,7 +62,7 @@ class TaughtPolicy(FastRecurrentPolicy):
         super().__init__(own, *args, **kwargs)
 
     def error(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
-        """``imitation_loss`` of the mean actions ``mean`` (n, 13) taken at ``obs``, (n,)."""
+        """``imitation_loss`` of the mean actions ``mean`` (n, 13) at observations ``obs``, (n,)."""
         limit = float(cast(spaces.Box, self.action_space).high[_STRIDE[0]])
         return imitation_loss(mean, obs[..., self.seen :], limit)
 
@@ -73,21 +83,21 @@ class TaughtPolicy(FastRecurrentPolicy):
 
 
 class ApprenticePolicy(TaughtPolicy):
-    """A ``TaughtPolicy`` that learns nothing but what it is taught."""
+    """A ``TaughtPolicy`` for imitation alone; its exploration noise is not trained."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        # Gradients of squared errors of actions are below SB3's eps of 1e-5 in the end.
+        # Gradients of the actions' squared errors end up below SB3's eps of 1e-5.
         super().__init__(*args, optimizer_kwargs={"eps": 1e-8, "fused": True}, **kwargs)
-        self.log_std.requires_grad_(False)  # what exploration is to begin with
+        self.log_std.requires_grad_(False)  # kept for the exploration afterwards
 
 
 def expected_price(stride: th.Tensor, price: th.Tensor, limit: float) -> th.Tensor:
-    """Price of strides (n, 2), the actions of frequency and stance length, (n,).
+    """Smoothed price of strides, (n,).
 
     Args:
-        stride: from -limit to limit.
-        price: (n, FREQUENCIES, LENGTHS) at even steps between these; what counts is a mean over
-            about two steps each way, so that the slope is felt from afar.
+        stride: (n, 2) actions of frequency and stance length, from -limit to limit.
+        price: (n, FREQUENCIES, LENGTHS) on an even grid over the same range. It is averaged over
+            about two grid steps either way, so that its slope is felt from afar.
         limit: of the actions.
     """
     for action, count in ((stride[:, 0], FREQUENCIES), (stride[:, 1], LENGTHS)):
@@ -99,26 +109,26 @@ def expected_price(stride: th.Tensor, price: th.Tensor, limit: float) -> th.Tens
 
 
 def imitation_loss(mean: th.Tensor, guidance: th.Tensor, limit: float) -> th.Tensor:
-    """How far actions (n, 13) are from what ``guidance`` (n, GUIDANCE) asks for, (n,)."""
+    """Imitation cost of actions ``mean`` (n, 13) against ``guidance`` (n, GUIDANCE), (n,)."""
     taught, aside, dearer, price = th.split(guidance, list(GUIDANCE_PARTS.values()), dim=1)
     error = (mean - taught).square()
     weight, priced = th.ones_like(error), price.amax(1) > 0.0
     weight[:, _STRIDE] = th.where(priced, _PRICED, 1.0)[:, None]
     other = (mean[:, WAY] - taught[:, WAY] - aside).square().sum(1) + _DEARER * dearer[:, 0]
-    saved = (error[:, WAY].sum(1) - other).clamp(min=0.0)  # by the second way around
+    saved = (error[:, WAY].sum(1) - other).clamp(min=0.0)  # by taking the second way around
     cost = expected_price(mean[:, _STRIDE], price.view(-1, FREQUENCIES, LENGTHS), limit)
     loss = ((weight * error).sum(1) - saved + _PRICE_WEIGHT * cost) / NUM_ACTIONS
     return th.where(priced, _LEAP_WEIGHT, 1.0) * loss
 
 
 class Lessons(NamedTuple):
-    """Rollouts of ``n`` robots, ``steps`` decisions long, sequence by sequence.
+    """Rollouts of ``n`` robots over ``steps`` decisions, one sequence per robot.
 
     Attributes:
         observations: (n, steps, size) with the teacher's guidance, float16.
         starts: (n, steps), 1 where an episode begins.
         returns: (n, steps).
-        memories: (4, n, hidden) before the first decision: h and c of the actor and the critic.
+        memories: (4, n, hidden), h and c of the actor and the critic before the first decision.
     """
 
     observations: th.Tensor
@@ -128,20 +138,20 @@ class Lessons(NamedTuple):
 
 
 class Notebook:
-    """The last rollouts, so that what is learned from one is not forgotten over the next.
+    """The latest rollouts, so that what is learned from one is not forgotten over the next.
 
-    A sequence starts with the memory that the apprentice had when it acted, though by now it might
-    have another (Kapturowski et al. 2019, R2D2, "stored state").
+    A sequence starts with the hidden state that the apprentice had when it acted, although its
+    current parameters might give another (Kapturowski et al. 2019, R2D2, "stored state").
 
     Args:
-        kept: how many rollouts.
+        kept: number of rollouts to keep.
     """
 
     def __init__(self, kept: int) -> None:
         self._rollouts: deque[Lessons] = deque(maxlen=kept)
 
     def add(self, rollout: WholeEnvBuffer) -> None:
-        """Keep a rollout, and drop the oldest of too many."""
+        """Add a rollout; beyond ``kept`` rollouts the oldest is dropped."""
         observations, starts, returns = (
             rollout.by_env(array)
             for array in (rollout.observations, rollout.episode_starts, rollout.returns)
@@ -150,7 +160,7 @@ class Notebook:
         self._rollouts.append(Lessons(observations.half(), starts, returns, memories))
 
     def batches(self, count: int) -> Iterator[Lessons]:
-        """``count`` minibatches: each robot once, in random order and from any rollout."""
+        """Yield ``count`` minibatches: each robot once, in random order, from a random rollout."""
         robots = len(self._rollouts[0].returns)
         for drawn in np.array_split(np.random.permutation(robots), count):
             which = np.random.randint(len(self._rollouts), size=len(drawn))
@@ -163,7 +173,7 @@ class Notebook:
             )
 
     def tensors(self) -> dict[str, th.Tensor]:
-        """All of it by name, for a checkpoint."""
+        """All kept rollouts as named tensors, for a checkpoint."""
         return {
             f"{_NOTES}{number}.{name}": tensor
             for number, lessons in enumerate(self._rollouts)
@@ -171,7 +181,7 @@ class Notebook:
         }
 
     def restore(self, tensors: Mapping[str, th.Tensor]) -> None:
-        """What ``tensors`` gave; other names are passed over."""
+        """Restore the rollouts from what ``tensors()`` gave; other names are ignored."""
         self._rollouts.clear()
         number = 0
         while f"{_NOTES}{number}.returns" in tensors:
@@ -181,10 +191,10 @@ class Notebook:
 
 
 class Apprentice(FastRecurrentPPO):
-    """``FastRecurrentPPO`` that learns what the teacher asks for instead of better actions.
+    """``FastRecurrentPPO`` that imitates the teacher instead of improving its actions.
 
     Args:
-        kept: rollouts that it learns from, the newest ones.
+        kept: number of newest rollouts that it learns from.
     """
 
     def __init__(self, *args: Any, kept: int = 1, **kwargs: Any) -> None:
@@ -192,7 +202,7 @@ class Apprentice(FastRecurrentPPO):
         super().__init__(*args, **kwargs)
 
     def train(self) -> None:
-        """One update: ``imitation_loss``, and the critic's squared error."""
+        """Make one update on ``imitation_loss`` and the critic's squared error."""
         policy = cast(ApprenticePolicy, self.policy)
         policy.set_training_mode(True)
         self._update_learning_rate(policy.optimizer)
@@ -212,7 +222,7 @@ class Apprentice(FastRecurrentPPO):
                 value_loss = nn.functional.mse_loss(values.flatten(), returns)
                 policy.optimizer.zero_grad()
                 imitation.backward()  # type: ignore[no-untyped-call]
-                # The actor's gradient alone: the critic, which shares no parameter, has none yet.
+                # Clips only the actor's gradient: the critic shares no parameters, so has none yet.
                 nn.utils.clip_grad_norm_(policy.parameters(), self.max_grad_norm)
                 (self.vf_coef * value_loss).backward()  # type: ignore[no-untyped-call]
                 policy.optimizer.step()

@@ -1,4 +1,4 @@
-"""What both trainers tell SB3's PPO: the settings they share, and learning rates."""
+"""PPO settings shared by both trainers, and their learning rate schedules."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ _SHARED = (
 
 
 def shared_keywords(ppo: PPOConfig | RecurrentPPOConfig) -> dict[str, Any]:
-    """Keyword arguments of SB3's PPO and RecurrentPPO."""
+    """Keyword arguments common to SB3's PPO and RecurrentPPO."""
     return {name: getattr(ppo, name) for name in _SHARED}
 
 
@@ -26,7 +26,7 @@ class LinearRate:
     last: float
 
     def __call__(self, remaining: float) -> float:
-        """At the share of the run that remains, 1 to 0."""
+        """Learning rate at the remaining share of the run, 1 to 0."""
         return self.last + remaining * (self.first - self.last)
 
 
@@ -35,15 +35,15 @@ class NoiseScaledRate(LinearRate):
     """A ``LinearRate`` times the mean standard deviation of the actions, see ``PPOConfig``.
 
     Attributes:
-        initial_std: before there is a policy.
-        log_std: the policy's parameter, to be set once it is built.
+        initial_std: standard deviation used until ``log_std`` is set.
+        log_std: the policy's parameter, to be set once the policy is built.
     """
 
     initial_std: float
     log_std: th.Tensor | None = None
 
     def __call__(self, remaining: float) -> float:
-        """At the share of the run that remains, 1 to 0."""
+        """Learning rate at the remaining share of the run, 1 to 0."""
         std = self.initial_std
         if self.log_std is not None:
             std = float(self.log_std.detach().exp().mean())

@@ -1,9 +1,9 @@
-"""RecurrentPPO with a fast update, exact (Sec. IV-B).
+"""RecurrentPPO with a fast but exact update (Sec. IV-B).
 
-sb3-contrib cuts a rollout where episodes start and pads the pieces to one length. Then it calls
-each LSTM step by step in Python, since a state has to be zeroed where an episode starts, and every
-step drags the gradients of all weights along. But an episode starts nowhere but at the beginning of
-a piece, so the states before the pieces are all there is to zero, and each LSTM is called once.
+sb3-contrib cuts a rollout where episodes start and pads the pieces to equal length. It then calls
+each LSTM step by step in Python, because a hidden state has to be zeroed where an episode starts,
+and every step carries the gradients of all weights along. But episodes start only at the beginning
+of a piece, so only the states before the pieces need zeroing, and each LSTM is called once.
 
 A minibatch holds whole environments, as in OpenAI Baselines' PPO2 for recurrent policies: only the
 LSTMs see padding, and only where an episode starts within the rollout.
@@ -40,13 +40,13 @@ from tdgc.policies.learning import (
 
 @dataclass(frozen=True)
 class GaitNoise:
-    """How the gait channel, the last action, explores.
+    """Exploration noise of the gait channel, the last action.
 
     Attributes:
-        robots: that decide at once.
-        gaits: that it chooses from, in equal shares of the action's range.
-        hold: decisions that its noise is held for, within an episode. Each decision's noise is
-            still normally distributed, and its likelihood is that of one decision.
+        robots: number of robots that decide at once.
+        gaits: number of gaits to choose from, each an equal share of the action's range.
+        hold: number of decisions for which the noise is held, within an episode. Each decision's
+            noise is still normally distributed, and its likelihood is that of one decision.
     """
 
     robots: int
@@ -56,16 +56,17 @@ class GaitNoise:
 
 @dataclass(frozen=True)
 class MemoryExchange:
-    """Robots whose memories change places after each rollout.
+    """Exchange of hidden states between robots after each rollout.
 
-    A training tile is of one family throughout, so a memory that has seen pillars never meets a
-    trench, and a policy learns to expect none. With the memory of a robot on other ground it has to
-    act on what it sees.
+    A training tile is of one family throughout, so a hidden state that has seen pillars never meets
+    a trench, and a policy learns to expect none. With the hidden state of a robot on other ground
+    it has to act on what it sees.
 
     Attributes:
-        share: of the robots that exchange theirs, drawn anew each time.
+        share: of the robots that take part, drawn anew after each rollout.
         untold: column of the observation that is 1 where a robot is not told its family. Only such
-            robots take part: what the others are told says enough. None if nobody is told.
+            robots take part, because the others know their family from the observation. None if
+            no robot is told its family; then all can take part.
     """
 
     share: float
@@ -75,19 +76,19 @@ class MemoryExchange:
 class FastRecurrentPolicy(RecurrentActorCriticPolicy):
     """``MlpLstmPolicy`` with a fast ``evaluate_actions``; for ``FastRecurrentPPO``.
 
-    It takes the same arguments, has the same parameters and computes the same numbers; with a
-    ``mirror`` it is exactly left-right symmetric, and so is its value. With None for
-    ``lstm_hidden_size`` it is feed-forward, and the networks behind the LSTMs are all there is. An
-    ``encoder`` of these layer sizes stands before either LSTM, see ``EncodedLSTM``.
+    It takes the same arguments, has the same parameters and computes the same numbers. With a
+    ``mirror``, the policy and its value are exactly left-right symmetric. If ``lstm_hidden_size``
+    is None, the policy is feed-forward and consists only of the networks behind the LSTMs.
+    ``encoder`` gives the layer sizes of an encoder in front of each LSTM, see ``EncodedLSTM``.
 
     Attributes:
-        gait_bonus: weight of the gaits' entropy beside that of the normal distributions in what
-            ``evaluate_actions`` gives as entropy.
+        gait_bonus: weight of the gaits' entropy in the entropy that ``evaluate_actions`` returns,
+            which also contains that of the normal distributions.
 
     Raises:
-        ValueError: other LSTMs than plain ones of one layer, one each for actor and critic, or
-            other actions than normally distributed ones with one deviation each; an encoder before
-            none.
+        ValueError: the LSTMs are not plain ones of one layer, one each for actor and critic; the
+            actions are not normally distributed with one deviation each; or there is an encoder
+            but no LSTM.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         gait: GaitNoise | None = None,
         **kwargs: Any,
     ) -> None:
-        # SB3's Adam, in one operation instead of a dozen for each parameter.
+        # SB3's Adam, but fused: one operation instead of a dozen for each parameter.
         kwargs.setdefault("optimizer_kwargs", {"eps": 1e-5, "fused": True})
         self.mirror, self.gait, self.gait_bonus = mirror, gait, 0.0
         self.encoder_arch = tuple(encoder)
@@ -127,14 +128,14 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
             self.lstm_hidden_state_shape = (1, 1, self.lstm_actor.hidden_size)
             self.optimizer = self.optimizer_class(
                 self.parameters(),
-                lr=lr_schedule(1),  # type: ignore[call-arg]  # as SB3 has it
+                lr=lr_schedule(1),  # type: ignore[call-arg]  # as in SB3
                 **self.optimizer_kwargs,
             )
         if gait is not None and gait.hold > 1:
-            # The noise that is held, and for how many decisions by now; a checkpoint keeps it.
+            # The held noise and its age in decisions; as a buffer it is part of a checkpoint.
             self.held: th.Tensor
             self.register_buffer("held", th.zeros(2, gait.robots))
-        if mirror is not None:  # the parameters stay, so the optimiser has them
+        if mirror is not None:  # parameters stay the same, so the optimiser remains valid
             self.lstm_actor = MirroredLSTM(self.lstm_actor, mirror)  # type: ignore[assignment]
             critic = cast(nn.LSTM, self.lstm_critic)
             self.lstm_critic = MirroredLSTM(critic, mirror)  # type: ignore[assignment]
@@ -146,7 +147,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         if hidden is None:
             return NoMemory(self.features_dim)
         memory = EncodedLSTM(self.features_dim, self.encoder_arch, hidden, self.activation_fn)
-        memory.encoder.apply(functools.partial(self.init_weights, gain=math.sqrt(2.0)))  # as SB3's
+        memory.encoder.apply(functools.partial(self.init_weights, gain=math.sqrt(2.0)))  # as in SB3
         return memory.to(self.device)
 
     def _build_mlp_extractor(self) -> None:
@@ -154,14 +155,14 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         size = self.lstm_output_dim + (self.encoder_arch[-1] if self.encoder_arch else 0)
         self.mlp_extractor = kind(size, self.net_arch, self.activation_fn, self.device)
 
-    def forward(  # type: ignore[override]  # as sb3-contrib has it
+    def forward(  # type: ignore[override]  # as in sb3-contrib
         self,
         obs: th.Tensor,
         lstm_states: RNNStates,
         episode_starts: th.Tensor,
         deterministic: bool = False,
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor, RNNStates]:
-        """As ``MlpLstmPolicy`` has it; the gait channel's noise is held, see ``GaitNoise``."""
+        """Act as ``MlpLstmPolicy`` does, but hold the gait channel's noise, see ``GaitNoise``."""
         actions, values, log_prob, states = super().forward(
             obs, lstm_states, episode_starts, deterministic
         )
@@ -176,14 +177,14 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         actions[:, -1] = mean + std * noise
         return actions, values, self.action_dist.log_prob(actions), states
 
-    def evaluate_actions(  # type: ignore[override]  # as sb3-contrib has it
+    def evaluate_actions(  # type: ignore[override]  # as in sb3-contrib
         self, obs: th.Tensor, actions: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """Values, log probabilities and entropies of ``n_seq`` sequences of equal length.
+        """Evaluate ``n_seq`` sequences of equal length.
 
         Args:
             obs, actions: (n_seq * length, size), sequence by sequence.
-            lstm_states: before the first step, of actor and critic, each (1, n_seq, hidden).
+            lstm_states: of actor and critic before the first step, each (1, n_seq, hidden).
             episode_starts: (n_seq * length,), 1.0 where the state is zeroed before the step.
 
         Returns:
@@ -194,8 +195,7 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         return values, log_prob, entropy + self.bonus(obs, mean)
 
     def bonus(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
-        """What counts like the entropy of the mean actions ``mean`` (n, size) taken at ``obs``,
-        (n,)."""
+        """Bonus added to the entropy, (n,), for mean actions ``mean`` (n, size) at ``obs``."""
         if self.gait is None or self.gait_bonus <= 0.0:
             return mean.new_zeros(len(mean))
         limit = float(cast(spaces.Box, self.action_space).high[-1])
@@ -205,20 +205,23 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
     def unroll(
         self, obs: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """Mean actions (n_seq * length, size) and values (n_seq * length, 1), as
-        ``evaluate_actions`` has them."""
+        """Run actor and critic over the sequences; arguments as in ``evaluate_actions``.
+
+        Returns:
+            Mean actions (n_seq * length, size) and values (n_seq * length, 1).
+        """
         n_seq = lstm_states.pi[0].shape[1]
         starts = episode_starts.view(n_seq, -1) > 0.0
         length = starts.shape[1]
         cuts = starts.clone()
         cuts[:, 0] = True
-        first = cuts.flatten().nonzero().squeeze(1)  # of each piece
+        first = cuts.flatten().nonzero().squeeze(1)  # step of each piece
         sizes = th.diff(first, append=first.new_tensor([cuts.numel()]))
         offset = th.arange(int(sizes.max()), device=first.device)
-        # (n_seq * length,): where each step of the sequences is among (longest * pieces) steps.
+        # (n_seq * length,): index of each step among the (longest * pieces) padded steps.
         piece = th.repeat_interleave(sizes)
         place = (th.arange(cuts.numel(), device=first.device) - first[piece]) * len(first) + piece
-        # (longest, pieces); what pads a piece is thrown away again.
+        # (longest, pieces): index of the step in each padded place; padding is discarded later.
         steps = (first + offset.unsqueeze(1)).clamp_(max=cuts.numel() - 1)
         goes_on = ((first % length == 0) & ~starts.flatten()[first]).to(obs.dtype).view(1, -1, 1)
         pieces = cast(th.Tensor, self.extract_features(obs))[steps]
@@ -236,8 +239,8 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
 def gaussian(x: th.Tensor, mean: th.Tensor, log_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """Log probability of ``x`` (n, size) and entropy (n,) of independent normal distributions.
 
-    As ``DiagGaussianDistribution`` has them, without its checks of every value, a twentieth of the
-    update.
+    Same as ``DiagGaussianDistribution``, but without its checks of every value, which take a
+    twentieth of the update.
     """
     size = 0.5 * math.log(2.0 * math.pi) * len(log_std) + log_std.sum()
     log_prob = -0.5 * ((x - mean) * (-log_std).exp()).square().sum(1) - size
@@ -248,9 +251,10 @@ def gait_entropy(mean: th.Tensor, std: th.Tensor, limit: float, gaits: int) -> t
     """Entropy in nats of the gait that a normally distributed channel chooses, (n,).
 
     Args:
-        mean: (n,) of the channel; its noise has the deviation ``std``.
-        limit: the channel's range is from -limit to limit; what is beyond counts as its end.
-        gaits: that share the range equally.
+        mean: (n,) of the channel.
+        std: standard deviation of its noise.
+        limit: the channel's range is -limit to limit; values beyond count as its ends.
+        gaits: number of gaits, which share the range equally.
     """
     edges = th.linspace(-limit, limit, gaits + 1, device=mean.device)[1:-1]
     below = th.special.ndtr((edges - mean[:, None]) / std)
@@ -262,12 +266,12 @@ def gait_entropy(mean: th.Tensor, std: th.Tensor, limit: float, gaits: int) -> t
 def exchange_memories(
     states: RNNStates, seen: NDArray[np.float32], exchange: MemoryExchange
 ) -> None:
-    """Shuffle the memories of some robots among them, in place.
+    """Shuffle the hidden states of a random subset of the robots among them, in place.
 
     Args:
         states: of actor and critic, each (1, M, hidden).
         seen: (M, size), the robots' observations.
-        exchange: who takes part.
+        exchange: which robots take part.
     """
     untold = np.arange(len(seen))
     if exchange.untold is not None:
@@ -279,9 +283,9 @@ def exchange_memories(
 
 
 class _Everything:
-    """A mask without padding: RecurrentPPO takes the steps where ``mask > 1e-8``, all of them.
+    """Mask for batches without padding: ``mask > 1e-8``, as in RecurrentPPO, selects every step.
 
-    Indexing by booleans, and its gradient, was a tenth of the update.
+    Boolean indexing and its gradient took a tenth of the update.
     """
 
     def __gt__(self, other: float) -> slice:
@@ -291,10 +295,10 @@ class _Everything:
 class WholeEnvBuffer(RecurrentRolloutBuffer):
     """Rollout buffer whose minibatches hold whole environments."""
 
-    def get(  # type: ignore[override]  # as sb3-contrib has it
+    def get(  # type: ignore[override]  # as in sb3-contrib
         self, batch_size: int | None = None
     ) -> Generator[RecurrentRolloutBufferSamples, None, None]:
-        """Minibatches of about ``batch_size`` steps, each environment once, in random order."""
+        """Yield minibatches of about ``batch_size`` steps: each environment once, shuffled."""
         total = self.n_envs * self.buffer_size
         minibatches = total // (batch_size or total)
         steps = [
@@ -324,11 +328,11 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
             )
 
     def by_env(self, array: NDArray[np.float32]) -> th.Tensor:
-        """(n_steps, n_envs, ...) -> (n_envs, n_steps, ...)."""
+        """Swap axes: array (n_steps, n_envs, ...) -> tensor (n_envs, n_steps, ...)."""
         return self.to_torch(array.swapaxes(0, 1))
 
     def first_memories(self) -> th.Tensor:
-        """(4, 1, n_envs, hidden) before the first step: h and c of the actor and the critic."""
+        """h and c of the actor and the critic before the first step, (4, 1, n_envs, hidden)."""
         first = [
             array[0]
             for array in (
@@ -344,11 +348,11 @@ class FastRecurrentPPO(RecurrentPPO):
 
     Args:
         gait_ent_coef: weight of the gaits' entropy (``GaitNoise``) in the loss at the first step;
-            it falls linearly to nothing at the last. It needs an ``ent_coef`` above 0 beside it.
-        exchange: of memories; none if None.
+            it falls linearly to zero at the last. It requires an ``ent_coef`` above 0.
+        exchange: exchange of hidden states after each rollout; None for no exchange.
 
     Raises:
-        ValueError: a ``batch_size`` below ``n_steps``, which holds no environment's rollout.
+        ValueError: ``batch_size`` is below ``n_steps``, too small for one environment's rollout.
     """
 
     def __init__(
@@ -362,7 +366,7 @@ class FastRecurrentPPO(RecurrentPPO):
         super().__init__(*args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
-        """As ``RecurrentPPO`` has it; then memories are exchanged."""
+        """Collect rollouts as ``RecurrentPPO`` does, then exchange hidden states."""
         complete = super().collect_rollouts(*args, **kwargs)
         if self.exchange is not None:
             seen = cast(NDArray[np.float32], self._last_obs)
@@ -370,9 +374,9 @@ class FastRecurrentPPO(RecurrentPPO):
         return complete
 
     def train(self) -> None:
-        """One update."""
+        """Make one update."""
         if self.gait_ent_coef:
-            # SB3 multiplies all of the entropy by ``ent_coef``.
+            # SB3 multiplies the whole entropy, bonus included, by ``ent_coef``.
             bonus = self.gait_ent_coef * self._current_progress_remaining / self.ent_coef
             cast(FastRecurrentPolicy, self.policy).gait_bonus = bonus
         super().train()

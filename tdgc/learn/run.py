@@ -1,9 +1,9 @@
-"""A run of a trainer: its folder, its phases, the learning loop, logs and interruption.
+"""A training run: its folder, its phases, the learning loop, logs and interruption.
 
 A run folder holds ``config.json``, ``log.jsonl`` (a row every ``log_steps``), TensorBoard's event
-files, ``policy.safetensors`` with ``policy.json`` (the last policy, ready to be used) and
-``checkpoints/`` with the two newest states, from which a run goes on, in the middle of its
-episodes, as if it had not been stopped.
+files, ``policy.safetensors`` with ``policy.json`` (the latest policy, ready for use) and
+``checkpoints/`` with the two newest checkpoints, from which a run resumes, in the middle of its
+episodes, as if it had never stopped.
 """
 
 import dataclasses
@@ -37,14 +37,14 @@ from tdgc.parallel.worker import MakeLink, WorkerError, memory_mb
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of a run with its own environment.
+    """A part of a run with its own environment.
 
     Attributes:
-        name: for the progress bar.
-        build: makes the learner and its workers, given their ``timeout`` and what starts one.
+        name: for the progress bar and the policy that the phase leaves.
+        build: makes the learner and its workers, given the workers' timeout in s and their link.
         until: steps of the run at which the phase ends.
-        own_levels: whether robots begin on the levels that its environment has them begin on; else
-            they stay on those where the phase before left them.
+        own_levels: whether robots begin on the levels that the phase's environment sets; otherwise
+            they stay on the levels where the previous phase left them.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Phase:
 
 
 class Interruption:
-    """Turns SIGINT, SIGTERM and a time limit into one flag that the loop looks at."""
+    """Turns SIGINT, SIGTERM and a time limit into one flag that the learning loop checks."""
 
     def __init__(self, time_limit: float | None) -> None:
         self.reason: str | None = None
@@ -68,14 +68,14 @@ class Interruption:
         self.reason = signal.Signals(number).name
 
     def due(self) -> bool:
-        """Whether to stop now."""
+        """Whether the run should stop now."""
         if self.reason is None and self._deadline is not None:
             if time.monotonic() > self._deadline:
                 self.reason = "the time limit"
         return self.reason is not None
 
     def tell(self, run: Path) -> None:
-        """Say what stopped the run in the folder ``run``, and how it goes on."""
+        """Print what stopped the run in the folder ``run`` and how to resume it."""
         tqdm.write(f"stopped by {self.reason}; --resume --out {run} goes on")
 
 
@@ -84,14 +84,14 @@ class Run:
     """A run of a trainer.
 
     Attributes:
-        folder: where it keeps everything.
+        folder: the run folder.
         config: of the whole run; written to the folder.
-        meta: goes into the policy's file.
+        meta: stored in the policy's file.
         summarise: sums of all workers -> values to log.
         interruption: when to stop.
-        worker_timeout: s, after which a silent worker is started again.
-        link: what starts a worker.
-        init: a policy to begin from.
+        worker_timeout: s, after which a silent worker is restarted.
+        link: how workers are started.
+        init: a policy to begin from, if any.
     """
 
     folder: Path
@@ -104,20 +104,20 @@ class Run:
     init: Path | None = None
 
     def train(self, phases: Sequence[Phase], resume: bool) -> bool:
-        """Go through the phases in order, from the newest checkpoint with ``resume``.
+        """Run the phases in order, starting from the newest checkpoint if ``resume`` is set.
 
         Returns:
-            Whether it came to its end; False when it was interrupted.
+            Whether the run finished; False if it was interrupted.
 
         Raises:
-            CheckpointError: nothing to resume that can be read.
-            ValueError: a policy in ``init`` that does not fit.
-            WorkerError: too many faults of workers; a checkpoint was written.
-            OSError: files that cannot be written, among them the last checkpoint.
+            CheckpointError: there is no readable checkpoint to resume from, or it does not fit.
+            ValueError: the policy ``init`` cannot be read or does not fit.
+            WorkerError: too many worker faults; a checkpoint was written.
+            OSError: a file cannot be written, for example the last checkpoint.
         """
         last = Checkpoint.newest(self.folder, tqdm.write) if resume else None
         if self.init is not None:
-            policies.load(self.init)  # before anything is written
+            policies.load(self.init)  # fail before anything is written
         self.folder.mkdir(parents=True, exist_ok=True)
         unsaved: OSError | None = None
         for number, phase in enumerate(phases):
@@ -137,8 +137,12 @@ class Run:
     def _go_through(
         self, phase: Phase, number: int, last: Checkpoint | None
     ) -> tuple[Checkpoint, bool, OSError | None]:
-        """One phase from where ``last`` left the run: how it stands then, whether it came to the
-        phase's end, and why that could not be written, if it could not."""
+        """Run one phase from the checkpoint ``last``, or from the start of the run if None.
+
+        Returns:
+            The checkpoint at its end; whether the phase finished; and the error if that checkpoint
+            could not be written.
+        """
         model, env = phase.build(self.worker_timeout, self.link)
         try:
             begins = 0 if last is None else last.steps
@@ -155,10 +159,10 @@ class Run:
                 if self.init is not None:
                     policies.load_into(self.init, model.policy)
                 env.reset()
-            self._write_config()  # of a run that has begun: what cannot begin leaves none behind
+            self._write_config()  # only now, so that a run that cannot start leaves none behind
             if last is not None:
                 drop_rows_after(last.steps, self.folder / "log.jsonl")
-            # What the robots saw last, as after a rollout of this learner.
+            # The latest observations, which SB3 otherwise keeps from the previous rollout.
             model._last_obs, model._last_episode_starts = env.seen(), env.starts()
             model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
             seconds = 0.0 if last is None else float(last.header["seconds"])
@@ -171,7 +175,7 @@ class Run:
                 raise
             taken = callback.save()
             if finished and phase.until < self.config.steps and callback.unsaved is None:
-                callback.save_policy(phase.name)  # what this phase gave, beside what comes of it
+                callback.save_policy(phase.name)  # keep it beside the policies of later phases
             return taken, finished, callback.unsaved
         finally:
             env.close()
@@ -185,7 +189,7 @@ class RunCallback(BaseCallback):
     """Progress, logs and checkpoints of a phase.
 
     Args:
-        run: that it is a phase of.
+        run: the run that the phase belongs to.
         env: the workers.
         name, number: of the phase.
         seconds_before: wall time of the run so far.
@@ -210,7 +214,7 @@ class RunCallback(BaseCallback):
 
     @property
     def seconds(self) -> float:
-        """Wall time of the run, over all its pieces."""
+        """Wall time of the run in s, including the time before it was resumed."""
         return time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
@@ -227,8 +231,8 @@ class RunCallback(BaseCallback):
         )
 
     def _on_rollout_start(self) -> None:
-        # Between an update and the next rollout the learner's state is whole. The workers forget in
-        # every run at every rollout, so that a checkpoint may be written at any or at none.
+        # Between an update and the next rollout the learner's state is complete. The workers forget
+        # before every rollout, so that writing a checkpoint or not makes no difference to the run.
         self.env.forget()
         if self.seconds - self._saved_at >= self.run.config.checkpoint_seconds:
             self.save()
@@ -239,7 +243,7 @@ class RunCallback(BaseCallback):
         return True
 
     def tell_faults(self) -> None:
-        """Tell of the workers that were started again, and keep it for the next log row."""
+        """Print the faults of restarted workers and keep them for the next log row."""
         while self.env.faults:
             fault = self.env.faults.pop(0)
             tqdm.write(str(fault))
@@ -251,12 +255,16 @@ class RunCallback(BaseCallback):
             self.log()
 
     def save(self) -> Checkpoint:
-        """Write the policy and a checkpoint, or tell why not; returns the checkpoint."""
+        """Write the policy and a checkpoint, or print why not, and return the checkpoint.
+
+        Raises:
+            ValueError: the policy is not finite; no checkpoint is written then.
+        """
         states = self.env.state_dicts()
         extra = {"workers": states, "seconds": self.seconds, "phase": self._number}
         taken = Checkpoint.take(self.model, extra)
         try:
-            # The policy first: it is refused when it is not finite, and a checkpoint should be.
+            # The policy first: if it is not finite, it is refused, and so is the checkpoint.
             self.save_policy("policy")
             taken.save(self.run.folder / "checkpoints")
             self.unsaved = None
@@ -266,7 +274,7 @@ class RunCallback(BaseCallback):
         return taken
 
     def save_policy(self, name: str) -> None:
-        """Write the policy as it stands, under ``name`` in the run's folder.
+        """Write the current policy as ``name`` in the run folder.
 
         Raises:
             ValueError: it is not finite.
@@ -277,7 +285,7 @@ class RunCallback(BaseCallback):
         policies.save(self.run.folder / name, policy, {**self.run.meta, **progress})
 
     def log(self) -> None:
-        """Write a row about the steps since the last one, if there are any."""
+        """Write a log row about the steps since the last row, if there are any."""
         steps, seconds = self._logged_at
         if steps == self.num_timesteps:
             return
@@ -308,7 +316,7 @@ class RunCallback(BaseCallback):
         row |= {k: _short(v) for k, v in values.items()} | {"faults": self._faults}
         try:
             append_line(self.run.folder / "log.jsonl", json.dumps(row))
-            if self._tensorboard_failed:  # its writer never recovers from an error
+            if self._tensorboard_failed:  # its writer cannot recover from an error
                 folder = self.run.folder / "tensorboard"
                 self.model.set_logger(tensorboard_logger(folder, steps))
             for key, value in values.items():
@@ -329,7 +337,7 @@ def _short(value: float) -> float:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Add a line to a file, all of it or nothing.
+    """Append a line to a file, completely or not at all.
 
     Raises:
         OSError: it cannot be written.
@@ -337,16 +345,16 @@ def append_line(path: Path, line: str) -> None:
     data = f"{line}\n".encode()
     with open(path, "ab", buffering=0) as file:
         end = file.tell()
-        if file.write(data) < len(data):  # the disk had room for a part
+        if file.write(data) < len(data):  # the disk had room for only a part
             file.truncate(end)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def drop_rows_after(steps: int, path: Path) -> None:
-    """Drop rows of a log beyond ``steps``: a run that was killed writes them again.
+    """Drop the rows of a log beyond ``steps``: a resumed run writes them again.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the log cannot be written.
     """
     if not path.exists():
         return
@@ -358,13 +366,13 @@ def drop_rows_after(steps: int, path: Path) -> None:
 
 
 def learn(model: Any, callback: RunCallback, until: int) -> bool:
-    """SB3's learning loop, up to ``until`` steps; False when it was interrupted.
+    """Run SB3's learning loop up to ``until`` steps; False if it was interrupted before.
 
-    Like ``OnPolicyAlgorithm.learn``, but it stops between two updates and never inside one, so
-    that a checkpoint written then is whole.
+    Like ``OnPolicyAlgorithm.learn``, but it stops only between two updates, so that a checkpoint
+    written then is complete.
 
     Raises:
-        WorkerError: too many faults of workers; the learner is as after the last update.
+        WorkerError: too many worker faults; the learner is as it was after the last update.
     """
     model._total_timesteps = until
     callback.init_callback(model)
@@ -386,10 +394,12 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
 
 
 def tensorboard_logger(folder: Path, steps: int) -> Logger:
-    """SB3's logger, writing TensorBoard's event files only, of a run that goes on from ``steps``:
-    TensorBoard shows nothing later that was logged before, since a killed run lost it."""
+    """SB3's logger, writing only TensorBoard event files, for a run that continues from ``steps``.
+
+    It makes TensorBoard discard earlier events beyond ``steps``, because a killed run lost them.
+    """
     output = TensorBoardOutputFormat(str(folder))
     restart = SessionLog(status=SessionLog.START)
-    writer = cast(Any, output.writer.file_writer)  # whose type torch does not tell
+    writer = cast(Any, output.writer.file_writer)  # torch declares no type for it
     writer.add_event(Event(step=steps + 1, session_log=restart))
     return Logger(str(folder), [output])

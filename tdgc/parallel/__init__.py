@@ -1,1 +1,1 @@
-"""Many robots at once: worker processes, on this machine or on a cluster."""
+"""Parallel simulation of many robots in worker processes, on this machine or on a cluster."""

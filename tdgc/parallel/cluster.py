@@ -1,8 +1,8 @@
-"""Workers on more than one machine: actors and tasks of Ray, the extra ``cluster``.
+"""Workers on more than one machine, as Ray actors and tasks (the extra ``cluster``).
 
-Ray runs on each machine already, see docs/cluster.md. This process joins it, and Ray decides which
-machine a worker or a batch of episodes goes to. Nothing else here knows Ray, and nothing imports
-it before it is asked for.
+Ray must already run on each machine, see docs/cluster.md. This process joins the cluster, and Ray
+decides which machine runs a worker or a batch of episodes. No other module of the package uses Ray,
+and it is only imported when a cluster is requested.
 """
 
 import copy
@@ -25,14 +25,14 @@ from tdgc.errors import InputError, require
 from tdgc.parallel.worker import BLAS_THREADS, Beginning, MakeTask, Worker, WorkerError, keep_memory
 from tdgc.state import State, copies
 
-_REACH_SECONDS = 5.0  # to be let in by the cluster
-_JOIN_SECONDS = 120.0  # for every node to start a Python and import this package
+_REACH_SECONDS = 5.0  # limit for connecting to the cluster's address
+_JOIN_SECONDS = 120.0  # limit for every node to start Python and import this package
 _RERUNS = 3  # of a job whose node was lost
-# Of a worker that was lost before it said a word: for some seconds Ray still sends workers to a
-# node that is gone.
+# Restarts of a worker that was lost before its first answer, and the pause before each: for some
+# seconds Ray still sends workers to a node that is gone.
 _RESTARTS, _PAUSE_SECONDS = 10, 1.0
 
-#: Of the flag ``--cluster``.
+#: Help text of the flag ``--cluster``.
 CLUSTER_HELP = (
     "simulate on this Ray cluster: host:port, or auto for the one in RAY_ADDRESS, or else the one "
     "on this machine"
@@ -43,18 +43,18 @@ Result = TypeVar("Result")
 
 
 class ClusterError(InputError):
-    """A cluster that cannot be used; the message is one line."""
+    """The cluster cannot be used; the message is one line."""
 
 
 def connect(address: str) -> int:
     """Join a running cluster, unless this process has joined one already.
 
     Args:
-        address: ``host:port``; or ``auto`` for the one that the variable ``RAY_ADDRESS`` names,
-            or without it the one that was started on this machine.
+        address: ``host:port``; or ``auto`` for the cluster named by the environment variable
+            ``RAY_ADDRESS`` or, if that is not set, the one running on this machine.
 
     Returns:
-        CPUs of the cluster.
+        Number of CPUs of the cluster.
 
     Raises:
         InputError: Ray is not installed.
@@ -74,10 +74,10 @@ def connect(address: str) -> int:
 
 
 def check_workers(workers: int, cpus: int) -> None:
-    """See that each of ``workers`` finds one of the cluster's ``cpus``: others would wait for ever.
+    """Check that the cluster has a CPU for each worker; without one a worker would wait for ever.
 
     Raises:
-        ClusterError: there are too few.
+        ClusterError: there are too few CPUs.
     """
     if workers > cpus:
         raise ClusterError(f"the cluster's {cpus} CPUs are too few for {workers} workers")
@@ -89,7 +89,7 @@ def _join(address: str) -> None:
     before = signal.getsignal(signal.SIGTERM)
     try:
         named = os.environ.get("RAY_ADDRESS", "auto") if address == "auto" else address
-        if named != "auto":  # Ray itself would wait for many minutes for a cluster that is gone.
+        if named != "auto":  # Ray itself would wait many minutes for a cluster that is gone.
             place = urllib.parse.urlsplit(f"//{named}")
             socket.create_connection((place.hostname, place.port or 0), _REACH_SECONDS).close()
         ray.init(
@@ -107,19 +107,19 @@ def _join(address: str) -> None:
         reason = " ".join(str(error).split())
         raise ClusterError(f"--cluster {address}: cannot be joined: {reason}") from error
     finally:
-        signal.signal(signal.SIGTERM, before)  # which Ray has replaced
+        signal.signal(signal.SIGTERM, before)  # Ray has replaced the handler
 
 
 def _check_nodes() -> None:
-    """See that this package has the same version on every node.
+    """Check that every node has the same version of this package.
 
     Raises:
-        ClusterError: it has not, is missing, or the node does not answer.
+        ClusterError: a node has another version, lacks the package, or does not answer.
     """
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    def version() -> str:  # within a function, so that a node without the package can run it
+    def version() -> str:  # nested, hence pickled by value, for nodes without the package
         import tdgc
 
         return tdgc.__version__
@@ -152,7 +152,7 @@ def _check_nodes() -> None:
 
 
 class _Actor:
-    """A worker on some node. Its answers are (answer, arrays that it changed, pid, address)."""
+    """A worker on some node; each method returns (answer, arrays it changed, pid, address)."""
 
     def start(
         self, make_task: MakeTask, views: dict[str, NDArray[Any]], seed: int, state: State | None
@@ -173,24 +173,25 @@ class _Actor:
 
         arrays = {name: self._views[name] for name in changed}
         if "terminated" in arrays:
-            arrays["last_obs"] = self._views["last_obs"][_ended(arrays)]  # few, so few bytes
+            arrays["last_obs"] = self._views["last_obs"][_ended(arrays)]  # few rows, so few bytes
         return answer, arrays, os.getpid(), ray.util.get_node_ip_address()
 
 
 def _ended(views: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Whose episode ended in the step, (M,)."""
+    """Which robots' episodes ended in the step, (M,)."""
     return np.asarray((views["terminated"] | views["truncated"]) != 0)
 
 
 class ActorLink:
-    """A worker in an actor of Ray, on whichever node has a CPU to spare.
+    """A worker in a Ray actor, on whichever node has a free CPU.
 
-    A message carries the arrays of all of its robots. Ray's own restarts are off: a worker that
-    is lost is told of, so that whoever has the link starts another one.
+    Each message carries the arrays of all of the worker's robots. Ray's own restarts are off: a
+    lost worker raises ``WorkerError``, so that the owner of the link can start another one. Only a
+    worker lost before its first answer is restarted here.
 
     Args:
         worker: its number.
-        beginning: what it begins with.
+        beginning: what it starts from.
     """
 
     def __init__(self, worker: int, beginning: Beginning) -> None:
@@ -247,7 +248,7 @@ class ActorLink:
             self._views["last_obs"][_ended(arrays)] = arrays.pop("last_obs")
         for key, array in arrays.items():
             self._views[key][:] = array
-        return copy.deepcopy(answer)  # what Ray gives cannot be written to
+        return copy.deepcopy(answer)  # what Ray returns is read-only
 
     def end(self, timeout: float) -> None:
         import ray
@@ -265,9 +266,9 @@ def _run(work: Callable[[Job], Result], job: Job) -> Result:
 
 
 def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    """``work`` on each job, in order, on ``workers`` CPUs of the cluster at most.
+    """Yield the results of ``work`` on each job, in order, using at most ``workers`` CPUs.
 
-    A job whose node is lost is done again on another one.
+    A job whose node is lost is repeated on another one.
 
     Raises:
         WorkerError: a job was lost too often.
@@ -277,7 +278,7 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
     run = ray.remote(_run).options(num_cpus=1, max_retries=_RERUNS, scheduling_strategy="SPREAD")
     shared = ray.put(work)
     rest = iter(enumerate(jobs))
-    running: dict[Any, int] = {}  # answer to be -> number of the job
+    running: dict[Any, int] = {}  # future answer -> number of its job
     done: dict[int, Result] = {}
     for wanted in range(len(jobs)):
         while wanted not in done:

@@ -1,7 +1,7 @@
-"""How many cores this process may use, and how many workers that makes.
+"""How many cores this process may use, and how many workers to start on them.
 
-The learner waits while its workers collect and they wait while it learns, so there are as many
-workers as cores. A step of a worker has fixed costs in numpy, which few robots do not pay for.
+The learner waits while its workers collect, and they wait while it learns, so there can be as many
+workers as cores. Each worker step has a fixed cost in numpy, too much for only a few robots.
 """
 
 import argparse
@@ -10,17 +10,17 @@ import os
 from pathlib import Path
 from typing import Literal
 
-#: A step costs a worker about 2 ms beside what each robot takes, 0.7 ms: with ten a fifth of it.
+#: A worker's step takes about 2 ms plus 0.7 ms per robot: with ten, the 2 ms are about a fifth.
 MIN_ROBOTS = 10
 
 Workers = int | Literal["auto"]
 
 
 def workers_flag(text: str) -> Workers:
-    """The value of ``--workers``: a number or auto.
+    """Parse the value of ``--workers``: a number or ``auto``.
 
     Raises:
-        argparse.ArgumentTypeError: neither.
+        argparse.ArgumentTypeError: it is neither.
     """
     if text == "auto":
         return "auto"
@@ -31,28 +31,28 @@ def workers_flag(text: str) -> Workers:
 
 
 def auto_workers(robots: int, cores: int) -> int:
-    """A worker a core, but none with fewer than ``MIN_ROBOTS`` robots unless it is alone."""
+    """One worker per core, each with at least ``MIN_ROBOTS`` robots unless it is the only one."""
     return max(1, min(cores, robots // MIN_ROBOTS))
 
 
 def usable_cores(system: Path = Path("/")) -> int:
-    """Cores that this process may use: those it is bound to, within its control groups' quotas.
+    """Number of cores this process may use: its CPU affinity, limited by control group quotas.
 
     Args:
-        system: where ``proc`` and ``sys`` are.
+        system: folder that contains ``proc`` and ``sys``.
     """
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return max(1, math.floor(min(bound or 1, _quota(system))))
 
 
 def _quota(system: Path) -> float:
-    """The least number of cores' worth of time that a control group of this process is given.
+    """The smallest CPU quota among the control groups of this process, in cores.
 
-    A container's engine or a batch system sets it, on the process's group or one above.
+    A container engine or a batch system sets it, on the process's own group or on a parent.
     """
     try:
         lines = (system / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
-    except OSError:  # no Linux
+    except OSError:  # not Linux
         return math.inf
     least = math.inf
     files: tuple[str, ...]
@@ -73,10 +73,10 @@ def _quota(system: Path) -> float:
 
 
 def _read_quota(folder: Path, files: tuple[str, ...]) -> float:
-    """Quota over period of one group, both in us; infinite where it has none or is not seen."""
+    """Quota over period of one group, both in us; infinite if it has no quota or is not visible."""
     try:
         words = " ".join((folder / name).read_text(encoding="utf-8") for name in files).split()
         quota, period = (float(word) for word in words)
-    except (OSError, ValueError):  # "max" is no number
+    except (OSError, ValueError):  # "max" is not a number
         return math.inf
-    return quota / period if quota > 0 else math.inf  # version 1 has -1 for none
+    return quota / period if quota > 0 else math.inf  # version 1 writes -1 for no quota

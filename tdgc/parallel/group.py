@@ -1,7 +1,7 @@
-"""Robots of several tasks in one worker, as one task.
+"""Several tasks in one worker, combined into one task.
 
-So some can be on a plane, where a control step costs less than half, while others are on terrain;
-and however many workers there are, each has its share of both.
+Some robots can then be on a plane, where a control step costs less than half as much, and others
+on terrain. Every worker gets its share of both, however many workers there are.
 """
 
 import itertools
@@ -15,11 +15,10 @@ from tdgc.state import State
 
 
 class TaskGroup:
-    """Several tasks as one (``tdgc.parallel.worker.Task``): the robots of the first, then of the
-    next.
+    """Several tasks as one ``tdgc.parallel.worker.Task``, their robots in the order of the tasks.
 
     Args:
-        tasks: of one action space and one observation space.
+        tasks: all with the same observation space and action space.
     """
 
     def __init__(self, tasks: Sequence[Task]) -> None:
@@ -40,7 +39,7 @@ class TaskGroup:
     def step(
         self, actions: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """One step of all: (M, n) -> reward, terminated, truncated, (M,) each."""
+        """Step all robots: (M, n) -> reward, terminated, truncated, (M,) each."""
         steps = [t.step(actions[rows]) for t, rows in zip(self.tasks, self._rows, strict=True)]
         reward, terminated, truncated = (
             np.concatenate(parts) for parts in zip(*steps, strict=True)
@@ -48,7 +47,7 @@ class TaskGroup:
         return reward, terminated, truncated
 
     def observe(self) -> NDArray[np.float32]:
-        """Observations of all, (M, n)."""
+        """Observations of all robots, (M, n)."""
         return np.concatenate([task.observe() for task in self.tasks])
 
     def restart(self) -> None:
@@ -57,12 +56,12 @@ class TaskGroup:
             task.restart()
 
     def forget(self) -> None:
-        """Let what follows depend on ``state_dict`` alone."""
+        """Make what follows depend on ``state_dict`` alone."""
         for task in self.tasks:
             task.forget()
 
     def take_stats(self) -> dict[str, float]:
-        """Sums over the tasks."""
+        """Statistics, summed over the tasks."""
         stats: dict[str, float] = {}
         for task in self.tasks:
             for key, value in task.take_stats().items():
@@ -70,7 +69,7 @@ class TaskGroup:
         return stats
 
     def state_dict(self) -> State:
-        """Of each task its randomness, its episodes, and the rest."""
+        """State of all tasks: random generators, episodes and the rest, each as a list."""
         states = [task.state_dict() for task in self.tasks]
         return {
             "rng": [state.pop("rng") for state in states],
@@ -79,10 +78,10 @@ class TaskGroup:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Go on from a ``state_dict``; from one without ``episodes`` with new ones.
+        """Continue from a ``state_dict``; without ``episodes`` in it, new ones begin.
 
         Raises:
-            ValueError: a state of other tasks.
+            ValueError: the state has another number of tasks.
         """
         if len(state["tasks"]) != len(self.tasks):
             raise ValueError(f"a state of {len(state['tasks'])} tasks, not {len(self.tasks)}")

@@ -1,4 +1,4 @@
-"""Independent jobs, such as batches of episodes, shared among processes of this machine."""
+"""Independent jobs, such as batches of episodes, shared among processes on this machine."""
 
 import multiprocessing as mp
 import signal
@@ -14,11 +14,11 @@ Result = TypeVar("Result")
 
 
 def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    """``work`` on each job, in order, on ``workers`` processes at most.
+    """Yield the results of ``work`` on each job, in order, using at most ``workers`` processes.
 
     Raises:
         WorkerError: a process died.
-        Exception: what ``work`` raised.
+        Exception: whatever ``work`` raised.
     """
     processes, others = min(workers, len(jobs)), set(mp.active_children())
     spawn = mp.get_context("spawn")
@@ -27,7 +27,7 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
             yield from pool.map(work, jobs)
         except BrokenProcessPool:
             raise WorkerError("a process died, perhaps for want of memory") from None
-        except BaseException:  # the jobs under way are wanted by nobody
+        except BaseException:  # the jobs under way are no longer needed
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(mp.active_children()) - others:
                 process.terminate()
@@ -37,11 +37,11 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
 def _begin() -> None:
     keep_memory()
     end_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that shares the jobs
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
 
 
 class RunJobs(Protocol):
-    """``run_jobs``, or what does the same elsewhere."""
+    """Signature of ``run_jobs`` here and in ``tdgc.parallel.cluster``."""
 
     def __call__(
         self, work: Callable[[Job], Result], jobs: Sequence[Job], workers: int

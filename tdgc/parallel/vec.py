@@ -1,4 +1,4 @@
-"""Many robots in a few workers behind Stable-Baselines3's VecEnv; workers that fail are mended."""
+"""Many robots in a few workers behind Stable-Baselines3's VecEnv; failed workers are replaced."""
 
 import atexit
 import itertools
@@ -22,22 +22,24 @@ from tdgc.parallel.worker import (
 )
 from tdgc.state import State, copies
 
-#: Faults of workers within so many steps that stop a run. A fault of the code comes back at once
-#: or in every episode, and the low policy's last 1000 steps; one of the machine does not. Workers
-#: that fail in one step count once: a machine takes all of its own with it.
+#: A run stops at this many worker faults within this many steps. A fault in the code recurs at
+#: once or in every episode, and the low policy's episodes last 1000 steps; a fault of the machine
+#: does not. Workers that fail together count once, because a lost machine takes all of its workers
+#: with it.
 FAULTS, FAULT_STEPS = 3, 1000
-# s to start in: ten times what imports and 60 robots' worlds took on a core shared by ten.
+# Limit for starting a worker: ten times what imports and the worlds of 60 robots took on a core
+# shared by ten processes.
 _START_SECONDS = 600.0
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault that was mended by a new worker.
+    """A worker's failure, after which a new worker took its place.
 
     Attributes:
         worker: its number.
-        reason: how it failed, with its own traceback if it has one.
-        restarts: how often this worker has been restarted by now.
+        reason: how it failed, with the worker's traceback if there is one.
+        restarts: how often this worker has been restarted so far.
         seed: of the new worker's task, see ``worker_seed``.
     """
 
@@ -53,7 +55,7 @@ class Fault:
 
 
 def worker_seed(seed: int, worker: int, restarts: int = 0) -> int:
-    """Seed of one worker's task, below 2**32; another one after each restart."""
+    """Seed of one worker's task, below 2**32; it differs after each restart."""
     return int(np.random.SeedSequence([seed, worker, restarts]).generate_state(1)[0])
 
 
@@ -66,30 +68,30 @@ def without_episodes(state: State) -> State:
 class TaskVecEnv(VecEnv):
     """``num_envs`` robots of a task, spread over ``workers`` workers.
 
-    Robots whose episode ended are reset within ``step``; ``infos`` holds their last observation
+    Robots whose episodes ended are reset within ``step``; ``infos`` holds their last observation
     and whether they were truncated, as SB3 expects.
 
-    With ``recover`` a worker that dies, hangs or raises is restarted with a seed of its own and
-    what its robots had learned when its state was last asked for (see ``state_dicts``); their
-    episodes end, truncated, with no reward for the step. Faults at ``FAULTS`` times within
-    ``FAULT_STEPS`` steps are raised all the same.
+    With ``recover``, a worker that dies, hangs or raises is restarted with a new seed and with what
+    its robots had learned when its state was last queried (see ``state_dicts``). The episodes of
+    its robots are truncated, with no reward for the step. ``FAULTS`` faults within ``FAULT_STEPS``
+    steps are raised all the same.
 
     Args:
         make_task: picklable, called in each worker as ``make_task(robots, seed)``.
-        num_envs: robots altogether.
-        workers: their number; the robots are shared out evenly.
-        seed: from which each worker's seed is drawn.
+        num_envs: total number of robots.
+        workers: their number; the robots are distributed evenly.
+        seed: each worker's seed is derived from it.
         spaces: observation and action space of the task.
         recover: restart workers that fail; otherwise the first fault is raised.
-        timeout: s without an answer after which a worker counts as hung. Of all that is asked,
-            building the worlds of 60 robots on terrain takes longest: 3 s of a core.
-        link: starts a worker; by default a process of this machine.
+        timeout: s without an answer after which a worker counts as hung. The slowest request is
+            building the worlds of 60 robots on terrain: 3 s on one core.
+        link: starts a worker; by default a process on this machine.
 
     Attributes:
-        faults: those mended so far; whoever tells of them takes them out.
+        faults: failures recovered from so far; whoever reports them removes them from the list.
 
     Raises:
-        ValueError: fewer robots than workers, no worker, or no timeout.
+        ValueError: fewer robots than workers, no worker, or a timeout that is not positive.
         WorkerError: a worker failed while starting.
     """
 
@@ -118,14 +120,14 @@ class TaskVecEnv(VecEnv):
         bounds = np.linspace(0, num_envs, workers + 1).astype(int).tolist()
         self._rows = [slice(*ends) for ends in itertools.pairwise(bounds)]
         self._restarts = [0] * workers
-        self._broken: dict[int, WorkerError] = {}  # workers that failed and were not mended yet
+        self._broken: dict[int, WorkerError] = {}  # failed, not yet replaced
         self._steps = 0
-        self._fault_steps = deque([-FAULT_STEPS] * FAULTS, maxlen=FAULTS)  # the last faults' steps
+        self._fault_steps = deque([-FAULT_STEPS] * FAULTS, maxlen=FAULTS)  # of the last faults
         self._links: list[Link] = []
-        atexit.register(self.close)  # or the interpreter would wait for the workers at its end
+        atexit.register(self.close)  # otherwise the interpreter waits for the workers at exit
         for k in range(workers):
             self._links.append(self._start(k))
-        # The last known ones; a worker begins by telling its own.
+        # The first answer of a worker is its state; the last known states are kept.
         states = [self._receive(k, _START_SECONDS) for k in range(workers)]
         if self._broken:
             self.close()
@@ -142,7 +144,7 @@ class TaskVecEnv(VecEnv):
         return self._link(worker, Beginning(self._make_task, self._arrays, rows, seed, state))
 
     def _replace(self, worker: int, restarts: int, state: State | None = None) -> None:
-        """Put a new worker in another one's place; it has to be waited for."""
+        """Replace a worker; the caller must wait for the new one's first answer."""
         self._links[worker].end(0.0)
         self._broken.pop(worker, None)
         self._restarts[worker] = restarts
@@ -150,7 +152,7 @@ class TaskVecEnv(VecEnv):
 
     @property
     def worker_pids(self) -> list[int]:
-        """Process numbers of the workers."""
+        """Process ids of the workers."""
         return [link.pid for link in self._links]
 
     def _send(self, word: str) -> None:
@@ -158,7 +160,7 @@ class TaskVecEnv(VecEnv):
             link.send(word)
 
     def _receive(self, worker: int, timeout: float) -> Any:
-        """A worker's answer; or the ``WorkerError``, which stays until the worker is replaced."""
+        """A worker's answer, or its ``WorkerError``, which is kept until the worker is replaced."""
         if worker not in self._broken:
             try:
                 return self._links[worker].receive(timeout)
@@ -170,7 +172,7 @@ class TaskVecEnv(VecEnv):
         """Every worker's answer, or its ``WorkerError``.
 
         Raises:
-            WorkerError: one failed, and no worker is to be restarted.
+            WorkerError: one failed, and ``recover`` is off.
         """
         answers = [self._receive(k, self.timeout) for k in range(len(self._links))]
         if self._broken and not self._recover:
@@ -182,10 +184,10 @@ class TaskVecEnv(VecEnv):
         return self._receive_all()
 
     def _mend(self) -> NDArray[np.bool_]:
-        """Restart the broken workers; their robots have new observations.
+        """Restart the broken workers; their robots get new observations.
 
         Returns:
-            (num_envs,) the robots concerned.
+            (num_envs,) which robots are affected.
 
         Raises:
             WorkerError: there were too many faults.
@@ -209,7 +211,7 @@ class TaskVecEnv(VecEnv):
                 concerned[self._rows[worker]] = True
         return concerned
 
-    # ------------------------------------------------------------------ as SB3 wants it
+    # ------------------------------------------------------------------ SB3's interface
 
     def reset(self) -> NDArray[np.float32]:
         """End all episodes, rebuild the worlds and return the first observations."""
@@ -228,7 +230,7 @@ class TaskVecEnv(VecEnv):
         return self._lengths == 0
 
     def forget(self) -> None:
-        """Let what follows depend on ``state_dicts`` alone, see ``Task``."""
+        """Make what follows depend on ``state_dicts`` alone, see ``Task``."""
         self._ask("forget")
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
@@ -261,17 +263,17 @@ class TaskVecEnv(VecEnv):
         return views["obs"].copy(), views["rewards"].copy(), done, infos
 
     def stats(self) -> list[dict[str, float]]:
-        """Each worker's sums since the last call, see ``Task.take_stats``, and ``blow_ups``.
+        """Each worker's sums since the last call (``Task.take_stats``), memory and ``blow_ups``.
 
-        A broken worker's are lost.
+        Those of a broken worker are lost.
         """
         return [sums for sums in self._ask("stats") if not isinstance(sums, WorkerError)]
 
     def state_dicts(self) -> list[State]:
-        """Each worker's state, with what its robots saw last and its ``restarts``.
+        """Each worker's state, with its robots' last observations and its ``restarts``.
 
-        Who loads it goes on as this does after ``forget``, bit for bit. A broken worker's is its
-        last known one, without the episodes under way.
+        An environment that loads them continues as this one does after ``forget``, bit for bit. For
+        a broken worker it is the last known state, without the episodes under way.
         """
         states = []
         for k, state in enumerate(self._ask("state")):
@@ -285,10 +287,10 @@ class TaskVecEnv(VecEnv):
         return states
 
     def load_state_dicts(self, states: list[State]) -> None:
-        """Go on from the workers' states; episodes that are missing in one start over.
+        """Continue from the workers' states; where one lacks its episodes, new ones begin.
 
         Raises:
-            ValueError: states of another number of workers or robots.
+            ValueError: the states are of another number of workers or robots.
             WorkerError: a worker failed.
         """
         if len(states) != len(self._links):
@@ -302,7 +304,7 @@ class TaskVecEnv(VecEnv):
             self._lengths[rows] = state.get("lengths", 0)
         for k, state in enumerate(states):
             restarts = state.get("restarts", 0)
-            if restarts != self._restarts[k]:  # its seed is another one
+            if restarts != self._restarts[k]:  # its seed differs
                 self._replace(k, restarts)
                 self._receive(k, _START_SECONDS)
             self._links[k].send("load", state)
@@ -312,13 +314,13 @@ class TaskVecEnv(VecEnv):
         self._states = [without_episodes(state) for state in states]
 
     def close(self) -> None:
-        """Stop the workers, gently and then not."""
+        """Stop the workers: the broken ones by force, others by force only after 5 s."""
         atexit.unregister(self.close)
         self._send("close")
         for k, link in enumerate(self._links):
             link.end(timeout=0.0 if k in self._broken else 5.0)
 
-    # What SB3 asks of every VecEnv and a batched world has no single environment to answer for.
+    # SB3 requires these of every VecEnv, but a batched world has no individual environments.
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         value = None if attr_name == "render_mode" else getattr(self, attr_name)
         return [value for _ in self._get_indices(indices)]

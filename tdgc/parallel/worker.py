@@ -1,11 +1,11 @@
-"""A worker: some robots of a task, in a process of its own, and the line to it.
+"""A worker: some robots of a task in a process of their own, and the connection to it.
 
-A worker answers one word at a time. Actions, observations, rewards and flags live in shared memory
-that dies with its processes; the pipes carry single words and now and then a state. Robots that
-blow up are reset where they are simulated.
+A worker answers one request at a time, each a single word. Actions, observations, rewards and flags
+are in shared memory that is freed with its processes; the pipes carry the words and an occasional
+state. The worker itself resets robots that blow up.
 
-Nothing here imports PyTorch or Stable-Baselines3, and neither does the low policy's task: a worker
-would take 150 MB more.
+Nothing here imports PyTorch or Stable-Baselines3, and neither does the low policy's task: they
+would add 150 MB to each worker.
 """
 
 import contextlib
@@ -31,17 +31,17 @@ from numpy.typing import NDArray
 
 from tdgc.state import State
 
-#: Observations and rewards are scaled to be of order one; beyond this a robot has blown up. For the
-#: low policy it means 50 m/s, 400 rad/s or 10 m above the ground.
+#: Observations and rewards are scaled to order one; a robot with larger ones has blown up. For the
+#: low policy the limit is 50 m/s, 400 rad/s or 10 m above the ground.
 SANE = 100.0
 
 
 class Task(Protocol):
-    """An MDP of M robots, as ``tdgc.tasks.low_env.LowLevelTask`` is one.
+    """An MDP of M robots, such as ``tdgc.tasks.low_env.LowLevelTask``.
 
-    ``state_dict()["rng"]`` is the state of all that is random in it and ``["episodes"]`` that of
-    the episodes under way; a task that loads a state without them begins new ones. ``forget``
-    changes nothing of the state, and makes what follows depend on nothing else.
+    ``state_dict()["rng"]`` is the state of its random generators and ``["episodes"]`` that of the
+    episodes under way; a task that loads a state without ``episodes`` begins new ones. ``forget``
+    leaves the state unchanged and makes what follows depend on nothing else.
     """
 
     num_robots: int
@@ -73,38 +73,38 @@ MakeTask = Callable[[int, int], Task]  # (number of robots, seed) -> task
 
 
 class WorkerError(RuntimeError):
-    """A worker died, hung or raised; the message carries its own traceback if it has one."""
+    """A worker died, hung or raised; the message includes its traceback if there is one."""
 
 
 class Link(Protocol):
-    """A worker as its learner sees it.
+    """A worker as seen by the learner.
 
     Attributes:
-        pid: number of its process, where it runs.
+        pid: its process id, on the machine where it runs.
     """
 
     @property
     def pid(self) -> int: ...
 
     def send(self, word: str, argument: Any = None) -> None:
-        """Ask something of it, see ``Worker.answer``. That it is gone shows at ``receive``."""
+        """Send a request, see ``Worker.answer``. A dead worker is only noticed by ``receive``."""
 
     def receive(self, timeout: float) -> Any:
-        """Its answer, within ``timeout`` s. The first one, unasked, is its state.
+        """Its answer, within ``timeout`` s. The first answer, without a request, is its state.
 
         Raises:
-            WorkerError: it died, hung or raised; nothing more can be asked of it.
+            WorkerError: it died, hung or raised; it accepts no further requests.
         """
 
     def end(self, timeout: float) -> None:
-        """End it, by force if it has not ended by itself within ``timeout`` s."""
+        """End it, by force if it is still running after ``timeout`` s."""
 
 
 # ---------------------------------------------------------------------------- the worker
 
 
 class Arrays:
-    """The arrays of some robots, in memory that is shared with processes that are given it."""
+    """The arrays of some robots, in memory shared with every process they are passed to."""
 
     def __init__(self, num: int, obs_dim: int, action_dim: int) -> None:
         self._shape = (num, obs_dim, action_dim)
@@ -118,7 +118,7 @@ class Arrays:
         }
 
     def views(self) -> dict[str, NDArray[Any]]:
-        """Views by name: actions, obs, last_obs (of episodes that ended), rewards, flags."""
+        """Views by name: actions, obs, last_obs (of ended episodes), rewards and the two flags."""
         num, obs_dim, action_dim = self._shape
         width = {"actions": action_dim, "obs": obs_dim, "last_obs": obs_dim}
         views: dict[str, NDArray[Any]] = {}
@@ -130,13 +130,14 @@ class Arrays:
 
 
 class Beginning(NamedTuple):
-    """What a worker begins with.
+    """What a worker starts from.
 
     Attributes:
         make_task: picklable, called where the worker runs as ``make_task(robots, seed)``.
-        arrays: of all robots; ``rows`` of them are the worker's.
+        arrays: of all robots.
+        rows: the worker's rows of ``arrays``.
         seed: of its task.
-        state: of a worker that failed; all but the randomness is taken over from it.
+        state: of a failed worker that this one replaces; all but its ``rng`` is used.
     """
 
     make_task: MakeTask
@@ -150,22 +151,22 @@ class Beginning(NamedTuple):
         return {name: view[self.rows] for name, view in self.arrays.views().items()}
 
 
-MakeLink = Callable[[int, Beginning], Link]  # its number, and how it begins -> a worker
+MakeLink = Callable[[int, Beginning], Link]  # (its number, what it starts from) -> worker
 
 
 def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
-    """One step of a worker's robots; those whose episode ended are reset.
+    """Step a worker's robots, reset those whose episodes ended, and return how many blew up.
 
     A robot that blew up gets no reward and is truncated, with its observation before the step as
-    the last one. Returns how many did.
+    the last one.
 
     Raises:
-        FloatingPointError: the task is not finite even after a reset.
+        FloatingPointError: observations are not finite even after a reset.
     """
     reward, terminated, truncated = task.step(views["actions"])
     obs = task.observe()
     blown = ~((np.abs(obs) <= SANE).all(axis=1) & (np.abs(reward) <= SANE))
-    # A robot with a NaN leaves Bullet's broad phase in disorder for good: the others of its client
+    # A NaN in one robot corrupts Bullet's broad phase permanently: the other robots of its client
     # fall through the ground. So the worlds are rebuilt, which ends every episode in them.
     poisoned = not (np.isfinite(obs).all() and np.isfinite(reward).all())
     obs[blown], reward[blown] = views["obs"][blown], 0.0
@@ -190,13 +191,13 @@ def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
 
 
 def _load(task: Task, views: dict[str, NDArray[Any]], state: State) -> None:
-    """Go on from a worker's state; what was seen last is part of it, for it may be noisy."""
+    """Continue from a worker's state, including the last observations, which may be noisy."""
     task.load_state_dict(state)
     views["obs"][:] = state["obs"] if "obs" in state else task.observe()
 
 
 class Worker:
-    """Some robots of a task, whose arrays are ``views``; the rest is as in ``Beginning``."""
+    """Some robots of a task with the arrays ``views``; other arguments as in ``Beginning``."""
 
     def __init__(
         self, make_task: MakeTask, views: dict[str, NDArray[Any]], seed: int, state: State | None
@@ -207,7 +208,7 @@ class Worker:
         self._blow_ups = 0
 
     def answer(self, word: str, argument: Any = None) -> Any:
-        """Do what the word says: step, restart, forget, load, state or stats."""
+        """Serve one request: step, restart, forget, load, state or stats."""
         answer = None
         if word == "step":
             self._blow_ups += _step(self.task, self._views)
@@ -228,9 +229,9 @@ class Worker:
 
 
 def memory_mb(pid: int) -> float:
-    """Memory of a process in MB, of pages that it shares its share (proportional set size).
+    """Memory of a process in MB, counting only its share of shared pages (proportional set size).
 
-    NaN where the system does not tell, which is anywhere but on Linux.
+    NaN where ``/proc/PID/smaps_rollup`` is missing, as on any system but Linux.
     """
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
@@ -243,7 +244,7 @@ def memory_mb(pid: int) -> float:
 
 
 def end_with_parent() -> None:
-    """Let this process end when its parent has, whatever it is busy with."""
+    """Make this process end when its parent does, whatever it is doing."""
     parent = mp.parent_process()
     assert parent is not None
 
@@ -255,8 +256,8 @@ def end_with_parent() -> None:
 
 
 def _serve(pipe: Connection, beginning: Beginning) -> None:
-    """A worker's life: tell its state, then answer one word at a time until told to close."""
-    # What a terminal or a batch system sends to all processes is the parent's to answer.
+    """Run a worker: send its state, then answer one request at a time until ``close``."""
+    # The parent handles the signals that a terminal or a batch system sends to all processes.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
@@ -280,15 +281,15 @@ def _serve(pipe: Connection, beginning: Beginning) -> None:
             worker.task.close()
 
 
-#: What sets the number of threads of a linear algebra call, whichever library makes it.
+#: Variables that set the number of threads of a linear algebra call, whichever library makes it.
 BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @contextlib.contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Processes started within get one thread a linear algebra call.
+    """Give processes started in this context one thread per linear algebra call.
 
-    Workers share the cores already, and threads that wait for each other on a busy core make a
+    The workers already occupy the cores, and threads that wait for each other on a busy core make a
     matrix product of this size forty times slower.
     """
     before = {name: os.environ.get(name) for name in BLAS_THREADS}
@@ -307,21 +308,23 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
 
 
 def keep_memory() -> None:
-    """Let this process keep the memory that it frees, where the C library is glibc.
+    """Make this process keep the memory that it frees, if the C library is glibc.
 
-    A batch's tiles take hundreds of MB. Taking them again from the system, page by page, was four
-    fifths of the time in which a world is made.
+    A batch's tiles take hundreds of MB. Requesting them anew from the system, page by page, took
+    four fifths of the time to build a world.
     """
     libc = ctypes.CDLL(None)
     if hasattr(libc, "mallopt"):
-        libc.mallopt(_M_MMAP_MAX, 0)  # all from the heap, none from mappings
-        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)  # and its top is not given back
+        libc.mallopt(_M_MMAP_MAX, 0)  # allocate from the heap only, never by mmap
+        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)  # never return the top of the heap
 
 
 @contextlib.contextmanager
 def _without_script(needed: Any) -> Iterator[None]:
-    """Processes started within do not import the script that runs, with all that it imports,
-    unless ``needed`` comes from there."""
+    """Keep processes started in this context from importing the running script.
+
+    They would import everything it imports. It is left in place if ``needed`` is defined in it.
+    """
     script = sys.modules["__main__"]
     if b"__main__" not in pickle.dumps(needed):
         sys.modules["__main__"] = types.ModuleType("__main__")
@@ -332,11 +335,11 @@ def _without_script(needed: Any) -> Iterator[None]:
 
 
 class ProcessLink:
-    """A worker in a process of this machine.
+    """A worker in a process on this machine.
 
     Args:
         worker: its number.
-        beginning: what it begins with.
+        beginning: what it starts from.
     """
 
     def __init__(self, worker: int, beginning: Beginning) -> None:
@@ -365,7 +368,7 @@ class ProcessLink:
                 raise WorkerError(f"worker {self._worker} gave no answer for {timeout:g} s")
             answer = self._pipe.recv()
         except (EOFError, OSError):
-            self._process.join(timeout=5.0)  # its pipe closes a moment before it ends
+            self._process.join(timeout=5.0)  # the pipe closes a moment before the process ends
             code = self._process.exitcode
             raise WorkerError(f"worker {self._worker} died (exit code {code})") from None
         if isinstance(answer, WorkerError):

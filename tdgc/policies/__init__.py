@@ -1,7 +1,7 @@
-"""Policies: their files, the side that acts and the side that learns.
+"""Policies: their files, inference without SB3, and the SB3 classes to train them.
 
-Whoever loads a policy and acts needs no SB3, so what is defined on it is imported when first
-asked for.
+Loading and running a policy does not need SB3, so whatever depends on SB3 is imported on first
+access.
 """
 
 from importlib import import_module

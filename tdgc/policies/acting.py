@@ -1,4 +1,4 @@
-"""The side that acts: a policy's file loaded, without SB3."""
+"""Inference: load a policy from its file and run it without SB3."""
 
 import contextlib
 import dataclasses
@@ -23,10 +23,10 @@ _FUNCTIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
 
 
 class Actor(nn.Module):
-    """The mean action, before it is clipped, after the LSTM if any: (n, inputs) -> (n, actions).
+    """The actor's MLP, behind the LSTM if any: (n, inputs) -> mean actions before clipping.
 
-    With a mirror it is exactly symmetric, as with ``MirroredHead``; what it takes from an LSTM are
-    then the latents of both sides, (2n, inputs).
+    The mean actions are (n, actions). With a mirror they are exactly symmetric, as with
+    ``MirroredHead``; from an LSTM it then takes the latents of both sides, (2n, inputs).
     """
 
     def __init__(self, header: Header, tensors: Mapping[str, th.Tensor]) -> None:
@@ -44,14 +44,14 @@ class Actor(nn.Module):
             self.mirror = tuple(th.tensor(part) for part in dataclasses.astuple(header.mirror))
 
     def both_sides(self, x: th.Tensor) -> th.Tensor:
-        """Observations (n, size) and behind them their mirror images, (2n, size)."""
+        """Observations (n, size), with a mirror followed by their mirror images, (2n, size)."""
         if self.mirror is None:
             return x
         obs_index, obs_sign, _, _ = self.mirror
         return th.cat([x, x.index_select(1, obs_index) * obs_sign])
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        # A recurrent policy's LSTM has seen both sides already.
+        # For a recurrent policy, x comes from an LSTM that already processed both sides.
         x = x if self.recurrent else self.both_sides(x)
         for layer in self.layers[:-1]:
             x = self.activation(layer(x))
@@ -63,23 +63,23 @@ class Actor(nn.Module):
         return x
 
     def tensors(self) -> dict[str, th.Tensor]:
-        """Its weights by their names in a policy's file."""
+        """The weights by their names in a policy's file."""
         return {f"actor.{name[7:]}": tensor for name, tensor in self.state_dict().items()}
 
 
 class Policy:
-    """A loaded policy: acts as SB3's does, without SB3.
+    """A loaded policy that acts as SB3's does, without SB3.
 
     Attributes:
-        header: what its file says.
+        header: of its file.
         kind: "mlp" or "lstm".
-        meta: what the caller of ``save`` gave.
+        meta: as given by the caller of ``save``.
         obs_dim: width of the full observation, actor and critic-only part.
         actor_dim: width of the part that the actor sees.
         action_dim: number of actions.
         low, high: bounds of the actions, (action_dim,), in the environment's action units.
-        tensors: all weights by the name in the file, the critic's too.
-        actor: what of them acts, the LSTM apart.
+        tensors: all weights by name in the file, including the critic's.
+        actor: the actor's MLP, without LSTM and encoder.
         state_size: width of h and of c, 0 for "mlp"; with a mirror twice the LSTM's size.
     """
 
@@ -106,7 +106,7 @@ class Policy:
         self.seed(0)
 
     def seed(self, seed: int | None) -> None:
-        """Restart the noise of ``predict(..., deterministic=False)``."""
+        """Seed the noise of ``predict(..., deterministic=False)``."""
         self._rng = np.random.default_rng(seed)
 
     def predict(
@@ -116,19 +116,19 @@ class Policy:
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
     ) -> tuple[Array, State | None]:
-        """Actions for observations, in SB3's convention.
+        """Compute actions for observations, in SB3's convention.
 
         Args:
             obs: (n, d) or (d,), where d is ``actor_dim`` or ``obs_dim``; of the latter only the
                 actor part is used.
             state: (h, c), each (1, n, hidden), as returned before; None for zeros. For "mlp" it
-                is handed back as it came. With a mirror ``hidden`` is twice the LSTM's size.
+                is returned unchanged. With a mirror ``hidden`` is twice the LSTM's size.
             episode_start: (n,) or a scalar, true where the state is to be zeroed first.
-            deterministic: the mean action, or else one drawn from the Gaussian.
+            deterministic: return the mean action; otherwise sample from the Gaussian.
 
         Returns:
             Actions clipped to ``low`` and ``high``, (n, action_dim) or (action_dim,), and the new
-            state, (h, c) or what was given.
+            state (h, c), or for "mlp" the given one.
 
         Raises:
             ValueError: an observation or state of the wrong shape.
@@ -156,10 +156,17 @@ class Policy:
     def remember(
         self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
     ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
-        """One step of the LSTM: (n, inputs) and two (n, hidden) -> latents for the actor, two.
+        """Run one step of the encoder, if any, and the LSTM.
 
-        With a mirror ``hidden`` is twice the LSTM's size: first the side that is seen, then its
-        mirror image.
+        With a mirror ``hidden`` is twice the LSTM's size: first the observed side, then its mirror
+        image.
+
+        Args:
+            x: (n, inputs).
+            state: h and c, each (n, hidden).
+
+        Returns:
+            Latents for the actor, (n, latent), with a mirror (2n, latent); and the new h and c.
         """
         sides = 1 if self.actor.mirror is None else 2
         x = self.actor.both_sides(x)
@@ -174,7 +181,7 @@ class Policy:
     def _previous(
         state: State | None, episode_start: ArrayLike | None, n: int, hidden: int
     ) -> tuple[th.Tensor, th.Tensor]:
-        """(h, c), each (n, hidden), with the rows that start an episode at zero."""
+        """(h, c), each (n, hidden), with the rows that start an episode zeroed."""
         if state is None:
             return th.zeros(n, hidden), th.zeros(n, hidden)
         shapes = [np.shape(part) for part in state]
@@ -189,10 +196,10 @@ class Policy:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """PyTorch on one thread, as a context or a decorator.
+    """Run PyTorch on one thread, as a context manager or a decorator.
 
-    The networks are too small to share out: one thread costs nothing when cores are idle, is
-    several times faster when they are not, and gives the same bits whatever the setting.
+    The networks are too small to parallelise: one thread costs nothing when cores are idle, is
+    several times faster when they are busy, and gives the same bits whatever the thread setting.
     """
     threads = th.get_num_threads()
     th.set_num_threads(1)
@@ -203,10 +210,10 @@ def one_thread() -> Iterator[None]:
 
 
 def load(path: str | os.PathLike[str]) -> Policy:
-    """The policy that ``save`` wrote as ``path`` (with or without one of the two suffixes).
+    """Load the policy that ``save`` wrote as ``path`` (with or without one of the two suffixes).
 
     Raises:
-        PolicyFileError: whatever is wrong with the files, in one line.
+        PolicyFileError: the files cannot be used; the message is one line.
     """
     header, tensors = read(path)
     return Policy(header, tensors)
@@ -218,10 +225,12 @@ def save_copy(
     changed: Mapping[str, th.Tensor],
     meta: dict[str, Any],
 ) -> None:
-    """Write a loaded policy with some of its weights ``changed``, by name, and another ``meta``.
+    """Write a loaded policy with some weights ``changed``, by name, and a new ``meta``.
 
     Raises:
-        ValueError, OSError: as ``save``; or a tensor that the policy has not or of another shape.
+        ValueError: as for ``save``, or a changed tensor that has no counterpart of its name and
+            shape in the policy.
+        OSError: the files cannot be written.
     """
     for name, tensor in changed.items():
         if name not in policy.tensors or tensor.shape != policy.tensors[name].shape:

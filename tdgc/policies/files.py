@@ -1,7 +1,7 @@
 """Policies and their files: weights as safetensors, everything else as JSON, no pickle anywhere.
 
 A policy on disk is two files side by side: ``NAME.safetensors`` holds the tensors of actor and
-critic, ``NAME.json`` says what they mean::
+critic, ``NAME.json`` describes them::
 
     {"format": "tdgc-policy", "version": 1,
      "kind": "mlp",                                   "mlp" (Sec. IV-A) or "lstm" (Sec. IV-B)
@@ -9,9 +9,9 @@ critic, ``NAME.json`` says what they mean::
                       "actor": [256, 128],            hidden sizes
                       "critic": [256, 128],
                       "lstm": null,                   hidden size of both LSTMs; null for "mlp"
-                      "encoder": [128]},              sizes before both LSTMs; left out if none
+                      "encoder": [128]},              layer sizes before both LSTMs; omitted if none
      "observation": {"size": 95, "actor_size": 70},   [actor part | critic-only part]
-     "mirror": null,                                  or how left and right change places
+     "mirror": null,                                  or how left and right swap, see Mirror
      "action": {"size": 12, "low": [...], "high": [...]},            null: unbounded
      "sha256": "...",                                 of NAME.safetensors
      "meta": {...}}                                   the caller's: configuration, seed, steps, ...
@@ -20,8 +20,8 @@ Tensors are float32, named ``actor.0.weight``, ``actor.0.bias``, ... (the last o
 action), ``critic.*`` likewise (the last one gives the value), ``log_std``, and for "lstm" also
 ``actor_lstm.*`` and ``critic_lstm.*`` with ``weight_ih``, ``weight_hh``, ``bias_ih``,
 ``bias_hh`` (gate order i, f, g, o as in PyTorch). With an encoder, ``actor_encoder.*`` and
-``critic_encoder.*`` are its layers; actor and critic are then given the LSTM's output and, after
-it, the encoder's.
+``critic_encoder.*`` are its layers; actor and critic then take the LSTM's output followed by the
+encoder's.
 """
 
 import dataclasses
@@ -57,7 +57,7 @@ _MAX_WEIGHT_BYTES = 256 * 2**20
 _MAX_SIZE = 65536  # of any layer, observation or action
 _MAX_LAYERS = 32
 _MAX_FLOAT32 = float(np.finfo(np.float32).max)
-_MAX_TENSOR_HEADER = 65536  # bytes of a safetensors file that are not weights
+_MAX_TENSOR_HEADER = 65536  # bytes of a safetensors file beside the weights
 
 
 class PolicyFileError(InputError):
@@ -68,8 +68,8 @@ class PolicyFileError(InputError):
 class Mirror:
     """How an observation and an action look in a left-right mirror.
 
-    ``sign * x[..., index]`` is x mirrored. The observation's part may be longer than the actor's,
-    whose entries then come first and stay among themselves.
+    ``sign * x[..., index]`` is x mirrored. ``obs_index`` and ``obs_sign`` may be longer than the
+    actor's part of the observation; the actor's entries then come first and map only to each other.
     """
 
     obs_index: tuple[int, ...]
@@ -78,10 +78,10 @@ class Mirror:
     action_sign: tuple[float, ...]
 
     def actor_part(self, size: int) -> "Mirror":
-        """The same for the first ``size`` entries of the observation.
+        """The mirror of the first ``size`` entries of the observation.
 
         Raises:
-            ValueError: one of them comes from beyond.
+            ValueError: one of these entries is mirrored from an entry beyond them.
         """
         if any(i >= size for i in self.obs_index[:size]):
             raise ValueError("the mirror mixes the actor's part with the critic's")
@@ -92,7 +92,7 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Header:
-    """The content of ``NAME.json``, checked."""
+    """The content of ``NAME.json``."""
 
     kind: str
     activation: str
@@ -104,7 +104,7 @@ class Header:
     low: tuple[float, ...]
     high: tuple[float, ...]
     meta: dict[str, Any]
-    mirror: Mirror | None = None  # of the actor's part
+    mirror: Mirror | None = None  # of the actor's part of the observation
     encoder: tuple[int, ...] = ()
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -131,14 +131,14 @@ class Header:
         return shapes
 
     def nbytes(self) -> int:
-        """Bytes that the weights take, all tensors together."""
+        """Total size of all weights in bytes."""
         return 4 * sum(math.prod(shape) for shape in self.shapes().values())
 
     def to_json(self, sha256: str) -> str:
         """The text of ``NAME.json``.
 
         Raises:
-            ValueError: ``meta`` holds something that JSON cannot say.
+            ValueError: ``meta`` holds something that JSON cannot represent.
         """
         table = {
             "format": FORMAT,
@@ -168,11 +168,11 @@ class Header:
 
     @classmethod
     def from_json(cls, text: str) -> tuple["Header", str]:
-        """Header and checksum from the text of ``NAME.json``.
+        """Parse and validate the text of ``NAME.json``; returns the header and the checksum.
 
         Raises:
-            PolicyFileError: not JSON, another format or version, a key too many or too few, a
-                value of the wrong type or out of range. Its message does not name the file.
+            PolicyFileError: not JSON, another format or version, an unknown or missing key, or a
+                value of the wrong type or out of range. The message does not name the file.
         """
         try:
             table = json.loads(text, parse_constant=_no_constant)
@@ -196,7 +196,7 @@ class Header:
 
         arch = table["architecture"]
         if isinstance(arch, dict):
-            arch = {"encoder": []} | arch  # files from before there was one lack it
+            arch = {"encoder": []} | arch  # older files have no encoder
         _check_keys(arch, ("activation", "actor", "critic", "lstm", "encoder"), "'architecture'")
         if not isinstance(arch["activation"], str) or arch["activation"] not in ACTIVATIONS:
             known = ", ".join(ACTIVATIONS)
@@ -306,12 +306,12 @@ def _bounds(value: Any, count: int, unbounded: float, name: str) -> tuple[float,
 
 
 def store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Tensor]) -> None:
-    """Write both files of a policy, each whole or not at all, weights first.
+    """Write both files of a policy, each atomically, weights first.
 
     Args:
-        path: with or without one of the two suffixes; missing folders are made.
-        header: what the JSON file says.
-        tensors: by name, of ``header.shapes()``, on any device; written as float32.
+        path: with or without one of the two suffixes; missing folders are created.
+        header: content of the JSON file.
+        tensors: by name, with the shapes of ``header.shapes()``, on any device; written as float32.
 
     Raises:
         ValueError: weights that are not finite, or a header that could not be read back.
@@ -327,7 +327,7 @@ def store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Te
     text = header.to_json(hashlib.sha256(weights).hexdigest()).encode()
     if len(text) > _MAX_JSON_BYTES:
         raise ValueError(f"meta takes {len(text)} bytes, more than {_MAX_JSON_BYTES}")
-    Header.from_json(text.decode())  # what could not be read back is not written
+    Header.from_json(text.decode())  # write nothing that cannot be read back
     stem = _stem(path)
     stem.parent.mkdir(parents=True, exist_ok=True)
     _write(_with_suffix(stem, ".safetensors"), weights)
@@ -335,8 +335,10 @@ def store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Te
 
 
 def header_file(path: str | os.PathLike[str]) -> Path:
-    """The ``NAME.json`` of a policy that is named with or without a suffix; the checksum of its
-    weights stands in it."""
+    """The ``NAME.json`` of a policy, named with or without a suffix.
+
+    It contains the checksum of the weights.
+    """
     return _with_suffix(_stem(path), ".json")
 
 
@@ -346,7 +348,7 @@ def _stem(path: str | os.PathLike[str]) -> Path:
 
 
 def _with_suffix(stem: Path, suffix: str) -> Path:
-    # Not Path.with_suffix, which would eat the ".5" of "low-v1.5".
+    # Not Path.with_suffix, which would drop the ".5" of "low-v1.5".
     return stem.parent / (stem.name + suffix)
 
 
@@ -371,14 +373,14 @@ def _read_bytes(path: Path, limit: int) -> bytes:
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
-    """What ``store`` wrote: the header, and the tensors by name, float32 in main memory.
+    """Read what ``store`` wrote: the header, and the tensors by name, float32 in main memory.
 
     Args:
         path: with or without one of the two suffixes.
 
     Raises:
-        PolicyFileError: a file that is missing, damaged, too large, or that the other one does not
-            fit; the message names it.
+        PolicyFileError: a file is missing, damaged, too large or does not match the other one; the
+            message names it.
     """
     stem = _stem(path)
     header_path, weights_path = _with_suffix(stem, ".json"), _with_suffix(stem, ".safetensors")
@@ -391,7 +393,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
     except PolicyFileError as error:
         raise PolicyFileError(f"{header_path}: {error}") from None
 
-    # The header's sizes are checked by now, and they bound what is read and allocated here.
+    # The header's sizes are validated by now, so they bound what is read and allocated here.
     shapes, need = header.shapes(), header.nbytes()
     data = _read_bytes(weights_path, need + _MAX_TENSOR_HEADER)
     if len(data) < need:
@@ -425,7 +427,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
 
 
 def _shown(value: Any) -> str:
-    return reprlib.repr(value)[:40]  # repr fails on what is nested about as deep as can be read
+    return reprlib.repr(value)[:40]  # plain repr can fail on the deepest nesting that can be read
 
 
 def _one_line(error: Exception) -> str:

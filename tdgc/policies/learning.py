@@ -1,4 +1,4 @@
-"""The side that learns: an SB3 policy whose critic sees more than its actor, and its saving."""
+"""Training: an SB3 policy whose critic sees more than its actor, network parts, and saving."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -27,8 +27,8 @@ from tdgc.policies.files import (
 class AsymmetricMlpExtractor(nn.Module):
     """Two separate MLPs: the actor's on the first ``actor_dim`` features, the critic's on all.
 
-    With a mirror the latents of an observation and of its mirror image stand side by side, twice
-    as wide, for ``MirroredHead`` to average.
+    With a mirror, the latents of an observation and of its mirror image are concatenated, twice as
+    wide, for ``MirroredHead`` to average.
     """
 
     def __init__(
@@ -73,10 +73,10 @@ class AsymmetricMlpExtractor(nn.Module):
 
 
 class MirroredHead(nn.Module):
-    """Mean of a linear layer on a latent and, mirrored back, on its mirror image's latent.
+    """Mean of a linear layer's output and its mirrored-back output for the mirror image's latent.
 
-    So an action's mirror image is exactly the action for the mirrored observation, and a value is
-    the same in the mirror: half of what there is to learn.
+    The action for a mirrored observation is thus exactly the mirrored action, and the value is the
+    same for both, which halves what there is to learn.
     """
 
     def __init__(self, linear: nn.Linear, mirror: Mirror | None) -> None:
@@ -95,12 +95,12 @@ class MirroredHead(nn.Module):
 
 
 class NoMemory(nn.Module):
-    """Stands where an LSTM does in a feed-forward policy: it hands on what it is given.
+    """Identity in place of an LSTM, for a feed-forward policy.
 
-    It is called as ``nn.LSTM`` is; its state is a zero per robot that stays one.
+    It is called like ``nn.LSTM``; its state is one zero per robot that never changes.
 
     Attributes:
-        input_size, hidden_size, num_layers: as ``nn.LSTM`` has them.
+        input_size, hidden_size, num_layers: as in ``nn.LSTM``.
     """
 
     def __init__(self, input_size: int) -> None:
@@ -110,18 +110,18 @@ class NoMemory(nn.Module):
     def forward(
         self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
     ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
-        """(steps, n, input_size) and the state -> both as they came."""
+        """(steps, n, input_size) and the state -> both unchanged."""
         return x, state
 
 
 class EncodedLSTM(nn.Module):
-    """An LSTM behind an encoder, whose output goes past the LSTM, too.
+    """An LSTM behind an encoder whose output also bypasses the LSTM.
 
-    What is to be done now need not pass through the memory. It is called as ``nn.LSTM`` is.
+    Immediate reactions thus need not pass through the memory. It is called like ``nn.LSTM``.
 
     Attributes:
         encoder, lstm: its parts.
-        input_size, hidden_size, num_layers: as ``nn.LSTM`` has them, seen from outside.
+        input_size, hidden_size, num_layers: as in ``nn.LSTM``, for the module as a whole.
     """
 
     def __init__(
@@ -139,27 +139,29 @@ class EncodedLSTM(nn.Module):
     def forward(
         self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
     ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
-        """(steps, n, input_size) and the state -> (steps, n, hidden_size + encoder's last), and
-        the state after it."""
+        """Run the encoder and the LSTM.
+
+        (steps, n, input_size) and the state -> (steps, n, hidden_size + the encoder's last size)
+        and the new state.
+        """
         encoded = self.encoder(x)
         remembered, after = self.lstm(encoded, state)
         return th.cat([remembered, encoded], dim=-1), after
 
 
-#: What may stand where sb3-contrib has an LSTM.
+#: Modules that can take the place of sb3-contrib's LSTM.
 Memory = nn.LSTM | NoMemory | EncodedLSTM
 
 
 class MirroredLSTM(nn.Module):
-    """An LSTM, or what stands in its place, that sees an observation and its mirror image, in two
-    halves of a wider state.
+    """An LSTM, or a module in its place, that processes an observation and its mirror image.
 
-    It is called as ``nn.LSTM`` is. ``MirroredMlpExtractor`` and ``MirroredHead`` go on with the
-    halves.
+    The two sides occupy the halves of a state twice as wide. The module is called like ``nn.LSTM``;
+    ``MirroredMlpExtractor`` and ``MirroredHead`` process the halves further.
 
     Attributes:
-        lstm: what both halves go through.
-        input_size, hidden_size, num_layers: as ``nn.LSTM`` has them, seen from outside.
+        lstm: the module that both sides pass through.
+        input_size, hidden_size, num_layers: as in ``nn.LSTM``, for the module as a whole.
     """
 
     def __init__(self, lstm: Memory, mirror: Mirror) -> None:
@@ -173,8 +175,11 @@ class MirroredLSTM(nn.Module):
     def forward(
         self, x: th.Tensor, state: tuple[th.Tensor, th.Tensor]
     ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
-        """(steps, n, input_size) and two (1, n, hidden_size) -> both sides' outputs side by side,
-        and the two after it."""
+        """Run the LSTM on both sides.
+
+        (steps, n, input_size) and h and c, each (1, n, hidden_size) -> both sides' outputs,
+        concatenated along the last axis, and the new h and c.
+        """
         index, sign = cast(th.Tensor, self.index), cast(th.Tensor, self.sign)
         both = th.cat([x, x[..., index] * sign], dim=1)
         h, c = (th.cat(part.chunk(2, dim=-1), dim=1) for part in state)
@@ -184,7 +189,7 @@ class MirroredLSTM(nn.Module):
 
 
 class MirroredMlpExtractor(MlpExtractor):
-    """SB3's, on each half of what ``MirroredLSTM`` gives."""
+    """SB3's ``MlpExtractor``, applied to each half of the output of ``MirroredLSTM``."""
 
     def forward_actor(self, features: th.Tensor) -> th.Tensor:
         """(n, 2 feature_dim) -> (n, 2 latent_dim_pi)."""
@@ -198,12 +203,11 @@ class MirroredMlpExtractor(MlpExtractor):
 class AsymmetricActorCriticPolicy(ActorCriticPolicy):
     """SB3 policy for a Box observation laid out as [actor part | critic-only part].
 
-    The critic may be told what the robot cannot sense (friction, true velocity, payload); the
-    actor sees the first ``actor_dim`` entries and nothing else. Everything that SB3's
-    ``ActorCriticPolicy`` takes can be given too; ``net_arch`` and ``activation_fn`` have other
-    defaults here.
+    The critic can see what the robot cannot sense (friction, true velocity, payload); the actor
+    sees only the first ``actor_dim`` entries. All other arguments of SB3's ``ActorCriticPolicy``
+    are accepted, too; ``net_arch`` and ``activation_fn`` have different defaults here.
 
-    With a ``mirror`` the policy is exactly left-right symmetric, and so is its value.
+    With a ``mirror``, the policy and its value are exactly left-right symmetric.
 
     Raises:
         ValueError: the observation is not a flat Box, or ``actor_dim`` does not fit it.
@@ -248,12 +252,12 @@ class AsymmetricActorCriticPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        if self.mirror is not None:  # the heads keep their parameters, so the optimiser has them
+        if self.mirror is not None:  # parameters stay the same, so the optimiser remains valid
             self.action_net = MirroredHead(cast(nn.Linear, self.action_net), self.mirror)
             self.value_net = MirroredHead(self.value_net, None)  # type: ignore[assignment]
 
     def symmetric_log_std(self) -> th.Tensor:
-        """log sigma of the actions, (action_dim,), the same on both sides with a mirror."""
+        """Log standard deviation of the actions, (action_dim,); symmetric with a mirror."""
         log_std = cast(th.Tensor, self.log_std)
         if self.mirror is None:
             return log_std
@@ -267,20 +271,20 @@ class AsymmetricActorCriticPolicy(ActorCriticPolicy):
 def save(path: str | os.PathLike[str], policy: ActorCriticPolicy, meta: dict[str, Any]) -> None:
     """Write ``policy`` as ``path.safetensors`` and ``path.json``.
 
-    Each file is replaced atomically, weights first: a reader that comes in between sees a wrong
-    checksum, never a half-written file or the wrong meaning.
+    Each file is replaced atomically, weights first: a reader in between sees a checksum that does
+    not match, never a half-written file or weights under the wrong header.
 
     Args:
-        path: with or without one of the two suffixes; missing folders are made.
+        path: with or without one of the two suffixes; missing folders are created.
         policy: ``AsymmetricActorCriticPolicy``, SB3's ``MlpPolicy`` or sb3-contrib's
             ``MlpLstmPolicy`` (one layer, an LSTM each for actor and critic, or ``NoMemory`` or
             ``EncodedLSTM`` in their places) and subclasses, with a flat Box observation and action
             and a state-independent standard deviation.
-        meta: anything JSON can say: configuration, seed, steps, wall time, code version.
+        meta: anything JSON can represent: configuration, seed, steps, wall time, code version.
 
     Raises:
-        ValueError: a policy of another make, weights that are not finite, or ``meta`` that JSON
-            cannot say; nothing is written then.
+        ValueError: an unsupported policy, weights that are not finite, or ``meta`` that JSON
+            cannot represent; nothing is written then.
         OSError: the files cannot be written.
     """
     store(path, _describe(policy, meta), _tensors(policy))
@@ -289,10 +293,11 @@ def save(path: str | os.PathLike[str], policy: ActorCriticPolicy, meta: dict[str
 def load_into(path: str | os.PathLike[str], policy: ActorCriticPolicy) -> dict[str, Any]:
     """Copy the weights in ``path`` into an SB3 ``policy`` built with the same sizes.
 
-    For training on from a saved policy. Returns the file's ``meta``.
+    This is for continuing to train a saved policy. Returns the file's ``meta``.
 
     Raises:
-        PolicyFileError: whatever is wrong with the files, or a policy of another architecture.
+        PolicyFileError: the files cannot be used, or ``policy`` has another architecture.
+        ValueError: ``policy`` is of a kind that cannot be saved.
     """
     header, tensors = read(path)
     mine = _describe(policy, header.meta)
@@ -315,7 +320,7 @@ def load_into(path: str | os.PathLike[str], policy: ActorCriticPolicy) -> dict[s
 
 
 def _describe(policy: ActorCriticPolicy, meta: dict[str, Any]) -> Header:
-    """The header of an SB3 policy; ``ValueError`` where the format has no words for it."""
+    """The header of an SB3 policy; ``ValueError`` if the format cannot represent the policy."""
     obs_space, action_space = policy.observation_space, policy.action_space
     for name, space in (("observation", obs_space), ("action", action_space)):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
@@ -373,7 +378,7 @@ def _linear(layers: Iterable[nn.Module]) -> list[nn.Linear]:
 
 
 def _tensors(policy: ActorCriticPolicy) -> dict[str, th.Tensor]:
-    """The live parameters of an SB3 policy under the names of the file."""
+    """The live parameters of an SB3 policy by their names in the file."""
     extractor = policy.mlp_extractor
     tensors: dict[str, th.Tensor] = {"log_std": cast(th.Tensor, policy.log_std)}
     for net, body, output in (

@@ -1,1 +1,1 @@
-"""What is looked at: figures, films, the report, Bullet's window."""
+"""Visualisation: figures, films, the report and Bullet's window."""

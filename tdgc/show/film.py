@@ -1,7 +1,7 @@
 """Films and film strips of recorded episodes, drawn without a display.
 
-A frame is the robot on its tile, seen from behind and to the right, with its commands beside it
-and a gait diagram of the last seconds under it. MP4 needs PyAV, the extra ``video``.
+A frame shows the robot on its tile, seen from behind and from the right, with its commands beside
+it and a gait diagram of the last seconds below it. MP4 needs PyAV, the extra ``video``.
 """
 
 import contextlib
@@ -31,50 +31,50 @@ from tdgc.sim.terrain import TILE_SIZE, Tile, TileField, file_label
 from tdgc.sim.world import Stage
 from tdgc.tasks.rules import GOAL_RADIUS
 
-FRAME_SECONDS = 0.04  # 25 frames a second: every second control step
-ENDING_SECONDS = 1.0  # the last frame stays, so that the outcome can be read
-GIF_EVERY, GIF_SCALE = 2, 2  # a GIF has every second frame at half the size: a tenth of the bytes
+FRAME_SECONDS = 0.04  # 25 frames per second: every second control step
+ENDING_SECONDS = 1.0  # the last frame is held, so that the outcome can be read
+GIF_EVERY, GIF_SCALE = 2, 2  # a GIF has every second frame at half size: a tenth of the bytes
 
-# All in pixels. Even sizes, since the encoder halves the colours' resolution.
+# In pixels. Sizes are even because the encoder halves the resolution of the colours.
 _SCENE, _PANEL, _DIAGRAM = (660, 420), 300, 120
 SIZE = (_SCENE[0] + _PANEL, _SCENE[1] + _DIAGRAM)  # (width, height) of a frame
-_SHOT = (400, 260)  # a picture of a strip
-_MOMENTS = 5  # pictures of an episode in a strip
-_DIAGRAM_SECONDS = 3.0  # 6 to 12 cycles of the gait
+_SHOT = (400, 260)  # one picture of a strip
+_MOMENTS = 5  # pictures per episode in a strip
+_DIAGRAM_SECONDS = 3.0  # 6 to 12 gait cycles
 
-# The camera, relative to the direction of travel: it stands higher than any pillar.
+# The camera, relative to the tile's x axis (start to goal); it is higher than any pillar.
 _AZIMUTH, _ELEVATION, _DISTANCE = -2.45, 0.5, 1.8  # rad, rad, m
-_STRIP_DISTANCE = 2.4  # m: more of the tile where nothing moves
-_SMOOTHING = 1.0  # s, over which the camera's way is averaged
+_STRIP_DISTANCE = 2.4  # m: a strip's still pictures show more of the tile
+_SMOOTHING = 1.0  # s, averaging window of the camera's path
 
 _TEXTURE = 1024  # pixels along a tile: 8 mm each
 _GRID = 0.5  # m between the lines on the ground
 _GROUND, _GOAL = (222, 213, 196), (0, 140, 90)
 _INK, _GREY, _PALE = (30, 34, 40), (125, 130, 138), (226, 228, 232)
-_WANTED, _MARK = (176, 205, 235), (213, 94, 0)  # desired contact; what was measured
+_WANTED, _MARK = (176, 205, 235), (213, 94, 0)  # desired contact; measured values
 
-_MEASURED = ("vx", "vy", "yaw_rate", "body_height")  # commands that a recording has measured
+_MEASURED = ("vx", "vy", "yaw_rate", "body_height")  # commands whose actual values are recorded
 
 
 # ---------------------------------------------------------------------------- the stage
 
 
 def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans, which matplotlib brings along."""
+    """Load DejaVu Sans, which ships with matplotlib."""
     weight = "bold" if bold else "normal"
     name = font_manager.FontProperties(family="DejaVu Sans", weight=weight)
     return ImageFont.truetype(font_manager.findfont(name), size)
 
 
 def ground_picture(tile: Tile, way: Array | None = None, colour: str = "black") -> Image.Image:
-    """What is painted on the ground: height as brightness, a grid, the goal, and ``way`` (n, 2) m.
+    """Draw the ground's texture: height as brightness, a grid, the goal, and ``way`` (n, 2) m.
 
-    As ``Stage.paint`` wants it: rows along y, columns against x.
+    The layout is that of ``Stage.paint``: rows along y, columns against x.
     """
     index = np.rint((np.arange(_TEXTURE) + 0.5) / _TEXTURE * (len(tile.heights) - 1)).astype(int)
     heights = tile.heights[np.ix_(index, index)].astype(np.float64)
     low, high = float(heights.min()), float(heights.max())
-    # At least 0.3 m for the whole scale, or low relief would look as deep as a trench.
+    # The scale spans at least 0.3 m, or low relief would look as deep as a trench.
     light = 1.0 - 0.35 * (high - heights) / max(high - low, 0.3)
     pixels = (light[..., None] * np.array(_GROUND)).astype(np.uint8)
     image = Image.fromarray(np.ascontiguousarray(pixels[::-1].transpose(1, 0, 2)))
@@ -96,10 +96,10 @@ def ground_picture(tile: Tile, way: Array | None = None, colour: str = "black") 
 
 
 def field_of(tile: Tile) -> TileField:
-    """A field that holds one tile for good."""
+    """Make a field of this one tile, which cannot be changed."""
     field = TileField((1, 1))
     field.place(0, 0, tile)
-    field.heights.setflags(write=False)  # for a faster world
+    field.heights.setflags(write=False)  # makes the world faster
     return field
 
 
@@ -110,10 +110,10 @@ def set_stage(
     way: Array | None = None,
     colour: str = "black",
 ) -> Stage:
-    """A robot on ``tile``, with the ground painted (see ``ground_picture``) and a pole at the goal.
+    """Put a robot on ``tile``, with painted ground (``ground_picture``) and a pole at the goal.
 
     Raises:
-        WindowError: ``window`` where there is no display.
+        WindowError: ``window`` without a display.
     """
     stage = Stage(robot, PhysicsConfig(), field_of(tile), window)
     with tempfile.TemporaryDirectory() as folder:
@@ -127,7 +127,7 @@ def set_stage(
 
 @contextlib.contextmanager
 def staged(recording: Recording, trail: bool = False) -> Iterator[Stage]:
-    """The stage of ``recording``; ``trail`` paints the base's way on the ground."""
+    """Open the stage of ``recording``; ``trail`` paints the base's path on the ground."""
     r = recording
     tile = tile_of(r.seed, r.family, r.level, r.episode, r.condition)
     way = recording.position[:, :2] if trail else None
@@ -139,7 +139,7 @@ def staged(recording: Recording, trail: bool = False) -> Iterator[Stage]:
 
 
 def camera_way(recording: Recording) -> Array:
-    """What the camera looks at, (n, 3) m: the base's way, averaged over a second around."""
+    """Points that the camera looks at, (n, 3) m: the base's path, averaged over a second."""
     half = max(1, round(0.5 * _SMOOTHING / recording.dt))
     padded = np.pad(recording.position, ((half, half), (0, 0)), mode="edge")
     sums = np.cumsum(np.pad(padded, ((1, 0), (0, 0))), axis=0)
@@ -157,17 +157,17 @@ def _shoot(
 
 
 class Overlay:
-    """Draws what stands beside and under the picture: commands, gait, contacts."""
+    """Draws what surrounds the picture: commands, gait and contacts."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._gait = gait_index(recording.command)
         self._small, self._text, self._head = _font(11), _font(13), _font(20, bold=True)
-        height = recording.height - recording.robot.base_height  # as the command counts it
+        height = recording.height - recording.robot.base_height  # as in the command
         self._measured = dict(zip(_MEASURED, [*recording.velocity.T, height], strict=True))
 
     def frame(self, picture: Image.Image, i: int, ended: bool = False) -> Image.Image:
-        """Control step ``i`` with its picture, of ``SIZE``; ``ended`` says how it ended."""
+        """Compose the frame of control step ``i``, of ``SIZE``; ``ended`` adds the outcome."""
         image = Image.new("RGB", SIZE, "white")
         image.paste(picture, (0, 0))
         draw = ImageDraw.Draw(image)
@@ -181,7 +181,7 @@ class Overlay:
         return image
 
     def _commands(self, draw: ImageDraw.ImageDraw, i: int) -> None:
-        """The panel at the right: each command on its range, with what was measured."""
+        """Draw the right-hand panel: each command within its range, and its measured value."""
         r, x0, x1 = self._recording, _SCENE[0] + 14, SIZE[0] - 14
         draw.text((x0, 12), r.policy, POLICY_COLOURS[r.policy], self._head)
         draw.text((x1, 16), f"{(i + 1) * r.dt:.2f} s", _INK, self._text, "ra")
@@ -217,10 +217,10 @@ class Overlay:
             draw.rectangle([at(value) - 2, line - 6, at(value) + 2, line + 6], _INK)
 
     def _contacts(self, draw: ImageDraw.ImageDraw, i: int) -> None:
-        """The gait diagram: the last seconds, now at the right edge."""
+        """Draw the gait diagram of the last seconds; its right edge is the present."""
         r, left, right, top = self._recording, 44, SIZE[0] - 14, _SCENE[1] + 8
         n = round(_DIAGRAM_SECONDS / r.dt)
-        first = i + 1 - n  # of the window; below 0 there was nothing
+        first = i + 1 - n  # control step of the window; negative before the start
         scale = (right - left) / n
         seen = slice(max(0, first), i + 1)
         begin = left + scale * (seen.start - first)
@@ -243,7 +243,7 @@ class Overlay:
 
 
 def frames(recording: Recording) -> Iterator[Image.Image]:
-    """The film's frames, ``FRAME_SECONDS`` apart; the last one stays for ``ENDING_SECONDS``."""
+    """The film's frames, ``FRAME_SECONDS`` apart; the last one is held for ``ENDING_SECONDS``."""
     n, every = len(recording.command), _frame_steps(recording)
     way, overlay = camera_way(recording), Overlay(recording)
     with staged(recording) as stage:
@@ -265,14 +265,14 @@ def _frame_steps(recording: Recording) -> int:
 
 @contextlib.contextmanager
 def _mp4(path: Path, rate: Fraction) -> Iterator[Callable[[Image.Image], None]]:
-    """An MP4 file that is there once it is whole; a function that adds a frame."""
+    """Write an MP4 file, which appears once it is complete; yields a function that adds a frame."""
     require("MP4", ("av",), "video")
     import av
 
     with atomic(path) as partial, av.open(str(partial), "w", format="mp4") as file:
         stream: Any = file.add_stream("libx264", rate=rate, options={"crf": "23"})
         stream.width, stream.height = SIZE
-        stream.pix_fmt = "yuv420p"  # what browsers and players can show
+        stream.pix_fmt = "yuv420p"  # which browsers and players support
 
         def add(image: Image.Image) -> None:
             frame = av.VideoFrame.from_ndarray(np.asarray(image), format="rgb24")
@@ -283,7 +283,7 @@ def _mp4(path: Path, rate: Fraction) -> Iterator[Callable[[Image.Image], None]]:
 
 
 def film(recording: Recording, folder: Path, mp4: bool = True) -> None:
-    """Write ``film_<name>.gif`` and, with ``mp4``, ``film_<name>.mp4``, each whole or not at all.
+    """Write ``film_<name>.gif`` and, with ``mp4``, ``film_<name>.mp4``, each atomically.
 
     Raises:
         InputError: ``mp4`` without PyAV.
@@ -299,7 +299,7 @@ def film(recording: Recording, folder: Path, mp4: bool = True) -> None:
             if k % GIF_EVERY == 0:
                 size = (SIZE[0] // GIF_SCALE, SIZE[1] // GIF_SCALE)
                 reduced = frame.resize(size, Image.Resampling.LANCZOS)
-                # Of Pillow's methods the one that keeps the robot's orange, in half the bytes.
+                # The one of Pillow's methods that preserves the robot's orange, in half the bytes.
                 method = Image.Quantize.FASTOCTREE
                 small.append(reduced.quantize(method=method, dither=Image.Dither.NONE))
     with atomic(stem.with_suffix(".gif")) as partial:
@@ -314,15 +314,14 @@ def film(recording: Recording, folder: Path, mp4: bool = True) -> None:
 
 
 def moments(recording: Recording) -> list[int]:
-    """Control steps of a strip's pictures: evenly from the first to the last."""
+    """Control steps of a strip's pictures, evenly spaced from the first to the last."""
     return np.rint(np.linspace(0, len(recording.command) - 1, _MOMENTS)).astype(int).tolist()
 
 
 def strip(recordings: Sequence[Recording], folder: Path) -> Path:
-    """Write a film strip of the same tile under several policies, a row each; its path.
+    """Write a film strip of one tile, with a row per policy, and return its path.
 
-    Its name is ``strip_<family>_<level>.png``, with the condition at the end where that is not
-    nominal.
+    Its name is ``strip_<family>_<level>.png``; a condition other than nominal is appended.
 
     Raises:
         ValueError: recordings of different tiles.
@@ -348,7 +347,7 @@ def strip(recordings: Sequence[Recording], folder: Path) -> Path:
         with staged(r, trail=True) as stage:
             for column, i in enumerate(moments(r)):
                 x = left + column * (_SHOT[0] + gap)
-                # Drawn at twice the size and reduced: Bullet's renderer leaves edges jagged.
+                # Drawn at twice the size and reduced, because Bullet's renderer has jagged edges.
                 large = _shoot(stage, r, way, i, (2 * _SHOT[0], 2 * _SHOT[1]), _STRIP_DISTANCE)
                 image.paste(large.resize(_SHOT, Image.Resampling.LANCZOS), (x, y))
                 gait = GAITS[gaits[i]]
@@ -366,13 +365,13 @@ def strip(recordings: Sequence[Recording], folder: Path) -> Path:
     return path
 
 
-# ---------------------------------------------------------------------------- all of an evaluation
+# ---------------------------------------------------------------------------- a whole evaluation
 
 _Job = tuple[str, list[Recording]]
 
 
 def _produce(job: _Job, folder: Path, mp4: bool) -> str | None:
-    """A film with its sheet, or a strip; what went wrong, in a line."""
+    """Write a film and its sheet, or a strip; returns an error in one line, or None."""
     kind, recordings = job
     try:
         if kind == "strip":
@@ -386,8 +385,13 @@ def _produce(job: _Job, folder: Path, mp4: bool) -> str | None:
 
 
 def produce(recordings: Sequence[Recording], folder: Path, workers: int) -> list[str]:
-    """Write into ``folder`` a film and a sheet of each recording, and a strip of each cell's first
-    episode under all policies. Returns what could not be written, a line each.
+    """Write films, sheets and strips into ``folder``.
+
+    Each recording gets a film and a sheet; the first episode of each family, level and condition
+    gets a strip of all policies.
+
+    Returns:
+        What could not be written, one line each.
     """
     problems = []
     try:

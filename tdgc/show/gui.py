@@ -1,7 +1,7 @@
 """Bullet's own window: drive the low policy by hand, or watch a policy decide on a tile.
 
-The window only shows the robot; it is simulated apart, as everywhere else. So nothing that is done
-to the window changes what the robot does, except through the sliders.
+The window only displays the robot, which is simulated in a separate world. So nothing that happens
+in the window affects the robot, except the sliders.
 """
 
 import time
@@ -24,27 +24,27 @@ from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import GOING, OUTCOMES, outcome
 
 MODES = ("drive", "watch")
-_TEXT_SECONDS = 0.1  # between two texts, a decision's length: more often cannot be read
+_TEXT_SECONDS = 0.1  # between two texts, as long as a decision; faster ones cannot be read
 
 
 def slider_command(values: Array) -> Array:
-    """Where the sliders stand, (13,), as commands (15,): the 12 continuous ones and the gait.
+    """Convert slider values (13,) to commands (15,): the 12 continuous ones and the gait.
 
     Raises:
-        ValueError: a gait that rounds to none of ``GAITS``.
+        ValueError: the gait value rounds to none of ``GAITS``.
     """
     return np.concatenate([values[:12], gait_embedding(round(float(values[12])))])
 
 
 def describe(command: Array) -> str:
-    """Gait and velocities of a command (15,), for the text above the robot."""
+    """Format the gait and velocities of a command (15,) for the text above the robot."""
     parts = [GAITS[int(gait_index(command))]]
     parts += [f"{n} {command[INDEX[n]]:.2f} {UNITS[INDEX[n]]}" for n in ("vx", "vy", "yaw_rate")]
     return ", ".join(parts)
 
 
 class _Window:
-    """The stage in step with a world of one robot, at the pace of real time."""
+    """Keeps the stage in step with a world of one robot, in real time."""
 
     def __init__(self, loco: Locomotion, field: TileField, stage: Stage) -> None:
         self._loco, self._stage, self._dt = loco, stage, loco.physics.control_dt
@@ -53,7 +53,7 @@ class _Window:
         self._due = time.perf_counter()
 
     def update(self, step: int, text: str) -> None:
-        """Show the robot after control step number ``step``, and wait until that is due.
+        """Show the robot after control step ``step``, and wait until that step is due.
 
         Raises:
             WindowError: the window was closed.
@@ -62,19 +62,19 @@ class _Window:
         self._stage.show(state.position[0] - self._origin, state.quaternion[0], state.q[0])
         if step % self._every == 0:
             self._stage.follow(text)
-        self._due = max(self._due + self._dt, time.perf_counter())  # what is late stays late
+        self._due = max(self._due + self._dt, time.perf_counter())  # delays are not made up
         time.sleep(max(0.0, self._due - time.perf_counter()))
 
 
 def drive(low: Policy, cell: Cell, seed: int) -> None:
-    """Sliders for the 12 continuous commands and the gait, until the window is closed.
+    """Drive the robot with sliders for the 12 continuous commands and the gait.
 
-    A robot that falls, or leaves its tile, stands at the start again; so does one whose button is
-    pressed.
+    It runs until the window is closed. The robot returns to the start when it falls, collides or
+    leaves its tile, and when the button is pressed.
 
     Args:
         low: the low policy.
-        cell: says which tile; its policy does not matter.
+        cell: determines the tile; its policy does not matter.
         seed: of the evaluation's tiles.
 
     Raises:
@@ -108,7 +108,7 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
             window.update(step, describe(loco.command[0]))
             step += 1
     except WindowError:
-        pass  # closed: that is how it ends
+        pass  # the window was closed: the normal end
     finally:
         loco.world.close()
         stage.close()
@@ -118,7 +118,7 @@ class Monitor:
     """A ``Watcher`` that shows a batch of one robot in the window as it runs.
 
     Attributes:
-        text: what stands above the robot: what is commanded, and at the end the outcome.
+        text: shown above the robot: the commands, and finally the outcome.
     """
 
     def __init__(self, stage: Stage) -> None:
@@ -137,11 +137,11 @@ class Monitor:
 
 
 def watch(low: Policy, driver: Driver, cell: Cell, seed: int) -> None:
-    """Show one episode at the pace of real time, then its end until the window is closed.
+    """Show one episode in real time, then its last state until the window is closed.
 
     Args:
         low: the low policy.
-        driver: what commands it.
+        driver: commands the low policy.
         cell: the episode; its count is 1.
         seed: of the evaluation's tiles.
 
@@ -157,6 +157,6 @@ def watch(low: Policy, driver: Driver, cell: Cell, seed: int) -> None:
             stage.follow(monitor.text)
             time.sleep(_TEXT_SECONDS)
     except WindowError:
-        pass  # closed: that is how it ends
+        pass  # the window was closed: the normal end
     finally:
         stage.close()

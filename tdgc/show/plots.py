@@ -1,4 +1,4 @@
-"""Figures: files of rows, logs and recordings in, PNG out. Nothing here simulates or trains."""
+"""Figures (PNG) from result files, logs and recordings. Nothing here simulates or trains."""
 
 import csv
 import json
@@ -31,7 +31,7 @@ from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import TILE_SIZE
 from tdgc.tasks.rules import GOAL_RADIUS
 
-# Okabe and Ito's palette, which colour-blind eyes tell apart.
+# Okabe and Ito's palette, whose colours colour-blind readers can distinguish.
 POLICY_COLOURS = {
     "tdgc": "#0072B2", "tdgc-tuned": "#009E73", "gp": "#D55E00", "cues": "#CC79A7",
     "teacher": "#555555", "tdgc-mujoco": "#56B4E9",
@@ -39,9 +39,9 @@ POLICY_COLOURS = {
 GAIT_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7")
 _GROUND = LinearSegmentedColormap.from_list("ground", ["#ffffff", "#707070"])  # low to high
 
-_MOVING = 0.1  # m/s, slower than that is no direction of travel (v_th of the high policy's rewards)
-_SECTORS = 24  # of 15 degrees
-_DRAWN = 3  # episodes a family and policy in the figure of trajectories
+_MOVING = 0.1  # m/s, below which the direction of travel is undefined (v_th of the high rewards)
+_SECTORS = 24  # of 15 degrees each
+_DRAWN = 3  # episodes per family and policy in the figure of trajectories
 
 
 def _save(figure: Figure, out: Path) -> None:
@@ -53,10 +53,10 @@ def _save(figure: Figure, out: Path) -> None:
 
 
 def _caption(figure: Figure, text: str) -> None:
-    """A line below the panels, broken to the figure's width."""
+    """Add a caption below the panels, wrapped to the figure's width."""
     letters = int(
         14 * figure.get_size_inches()[0]
-    )  # of 9 points, half as wide as tall, and a margin
+    )  # letters of 9 points, half as wide as tall, and a margin
     figure.supxlabel(textwrap.fill(text, letters), fontsize=9)
 
 
@@ -65,8 +65,13 @@ def _caption(figure: Figure, text: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """An episode as ``tdgc.benchmark.results.write_results`` left it: its row, goal (2,), track
-    (n, 3)."""
+    """An episode as written by ``tdgc.benchmark.results.write_results``.
+
+    Attributes:
+        row: of episodes.csv.
+        goal: (2,).
+        track: (n, 3).
+    """
 
     row: dict[str, str]
     goal: Array
@@ -74,7 +79,7 @@ class _Run:
 
 
 def _read(folder: Path) -> list[_Run]:
-    """The episodes of the first condition in a results folder."""
+    """Read the episodes of the first condition in a results folder."""
     with open(folder / "episodes.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     with np.load(folder / "trajectories.npz") as data:
@@ -84,14 +89,14 @@ def _read(folder: Path) -> list[_Run]:
 
 
 def _name_condition(figure: Figure, runs: Sequence[_Run]) -> None:
-    """Head a figure with the condition of its episodes, unless that is the nominal one."""
+    """Title a figure with the condition of its episodes, unless that is nominal."""
     condition = runs[0].row["condition"]
     if condition != "nominal":
         figure.suptitle(f"condition {condition}")
 
 
 def _names(runs: Sequence[_Run], column: str) -> list[str]:
-    """What stands in a column, each once, in order."""
+    """Distinct values of a column, in order of appearance."""
     return list(dict.fromkeys(run.row[column] for run in runs))
 
 
@@ -100,7 +105,10 @@ def _of(runs: Sequence[_Run], policy: str, family: str) -> list[_Run]:
 
 
 def success_by_level(summary: Path, out: Path) -> None:
-    """Success with 95 % intervals by level (summary.json): a row a condition, a column a family."""
+    """Plot success with 95 % intervals by level, from summary.json.
+
+    There is a row per condition and a column per family.
+    """
     table = policies_of(json.loads(summary.read_text(encoding="utf-8")))
     conditions = list(dict.fromkeys(c for rates in table.values() for c in rates))
     families = {
@@ -126,7 +134,7 @@ def success_by_level(summary: Path, out: Path) -> None:
                 axis.errorbar(
                     np.array(list(cells)) + 0.16 * (k - 0.5 * (len(table) - 1)),
                     middle,
-                    # At 0 and 100 % an end of the interval is the rate, but for rounding.
+                    # At 0 and 100 % one end of the interval equals the rate, except for rounding.
                     np.maximum(0.0, [middle - ends[0], ends[1] - middle]),
                     marker="os"[k % 2],
                     markersize=4,
@@ -145,7 +153,7 @@ def success_by_level(summary: Path, out: Path) -> None:
 
 
 def gait_shares(folder: Path, out: Path) -> None:
-    """Share of the time in each gait by family, a panel a policy."""
+    """Plot the share of time in each gait by family, with a panel per policy."""
     runs = _read(folder)
     names, families = _names(runs, "policy"), _names(runs, "family")
     figure, axes = plt.subplots(
@@ -179,13 +187,14 @@ def gait_shares(folder: Path, out: Path) -> None:
 
 
 def heading_to_travel(track: Array) -> Array:
-    """Heading of the body against the direction it moves in, (k,) rad, while it moves.
+    """Compute the heading relative to the direction of travel, (k,) rad, while the robot moves.
 
-    0 is forwards, pi backwards, pi/2 to the body's right: the nose points left of the travel.
+    At 0 it moves forwards, at pi backwards, at pi/2 to its right: the nose points to the left of
+    the direction of travel.
 
     Args:
-        track: (n, 3) as in ``tdgc.benchmark.evaluation.Episode``; its last pose comes early and
-            is left out.
+        track: (n, 3) as in ``tdgc.benchmark.evaluation.Episode``. The last pose is left out,
+            because it may come less than ``POSE_SECONDS`` after the one before.
     """
     x, y, yaw = track[:-1].T
     dx, dy = np.diff(x), np.diff(y)
@@ -195,7 +204,7 @@ def heading_to_travel(track: Array) -> Array:
 
 
 def headings(folder: Path, out: Path) -> None:
-    """Where the nose points against the direction of travel, a row a policy, a column a family."""
+    """Plot headings relative to the direction of travel, by policy (rows) and family (columns)."""
     runs = _read(folder)
     names, families = _names(runs, "policy"), _names(runs, "family")
     figure, axes = plt.subplots(
@@ -207,7 +216,7 @@ def headings(folder: Path, out: Path) -> None:
         layout="constrained",
     )
     width = 2 * np.pi / _SECTORS
-    edges = np.linspace(-np.pi, np.pi, _SECTORS + 1) + 0.5 * width  # a sector straight ahead
+    edges = np.linspace(-np.pi, np.pi, _SECTORS + 1) + 0.5 * width  # centre a sector straight ahead
     for row, policy in zip(axes, names, strict=True):
         for axis, family in zip(row, families, strict=True):
             angles = np.concatenate(
@@ -234,7 +243,10 @@ def headings(folder: Path, out: Path) -> None:
 
 
 def trajectories(folder: Path, out: Path) -> None:
-    """Bases from above on the hardest level: a row a family, the first episodes of each policy."""
+    """Plot the base's path from above on the hardest level of each family.
+
+    There is a row per family, with the first episodes of each policy.
+    """
     runs = [run for run in _read(folder) if int(run.row["episode"]) < _DRAWN]
     hardest = {run.row["family"]: 0 for run in runs}
     for run in runs:
@@ -284,7 +296,7 @@ def trajectories(folder: Path, out: Path) -> None:
 
 
 def _draw_track(axis: Any, run: _Run) -> None:
-    """The base's way, its heading once a second, the goal, and how the episode ended."""
+    """Draw the base's path, its heading once a second, the goal and the outcome."""
     colour, white = (
         POLICY_COLOURS[run.row["policy"]],
         [withStroke(linewidth=3.5, foreground="white")],
@@ -307,18 +319,18 @@ def _draw_track(axis: Any, run: _Run) -> None:
 # ---------------------------------------------------------------------------- one episode
 
 _MEASURED = "#D55E00"
-_DESIRED = "#B0CDEB"  # contact as the gait desires, behind the actual one
+_DESIRED = "#B0CDEB"  # desired contact, drawn behind the actual one
 
 
 def sheet(recording: Recording, out: Path) -> None:
-    """One episode on one time axis: gait, contacts (Hildebrand), base height, all commands.
+    """Plot one episode over time: gait, contacts (Hildebrand), base height and all commands.
 
-    Where a command has been measured too, that is drawn over it; dotted lines are its bounds.
+    Measured values are drawn together with their commands; dotted lines are the bounds.
     """
     r = recording
     ends: Array = r.dt * np.arange(1.0, len(r.command) + 1.0)
     standing = r.robot.base_height
-    # Gait and contacts, then the four commands that were measured, then the others.
+    # Gait and contacts, then the four commands with measured values, then the others.
     ratios = [1.7] + [1.0] * 4 + [0.6] * (len(CONTINUOUS) - 4)
     figure, axes = plt.subplots(
         len(ratios), 1, figsize=(12, 13.5), sharex=True, height_ratios=ratios
@@ -356,7 +368,7 @@ def sheet(recording: Recording, out: Path) -> None:
 
 
 def _draw_contacts(axis: Any, r: Recording) -> None:
-    """The gait as a band; a row a foot below it, actual contact within the desired."""
+    """Draw the gait as a band, and below it a row per foot with desired and actual contact."""
     for a, b, gait in stretches(gait_index(r.command)):
         axis.broken_barh([(a * r.dt, (b - a) * r.dt)], (-0.75, 0.55), color=GAIT_COLOURS[gait])
     for foot in range(len(FEET)):
@@ -373,14 +385,14 @@ def _draw_contacts(axis: Any, r: Recording) -> None:
 def _draw_command(
     axis: Any, ends: Array, command: Array, bounds: Array, measured: Array | None
 ) -> None:
-    """A command over time, its bounds, and what was measured of it."""
+    """Draw a command over time, with its bounds and its measured value."""
     for bound in bounds:
         axis.axhline(bound, color="0.5", linestyle=":", linewidth=1)
     seen = [command, bounds]
     if measured is not None:
         axis.plot(ends, measured, color=_MEASURED, linewidth=0.9)
         seen.append(measured)
-    # A command holds during the whole control step, at whose end it was noted.
+    # A command holds for the whole control step at whose end it was recorded.
     axis.stairs(command, np.append(0.0, ends), baseline=None, color="black", linewidth=1.2)
     bottom, top = min(map(np.min, seen)), max(map(np.max, seen))
     margin = 0.12 * (top - bottom)
@@ -392,7 +404,7 @@ def _draw_command(
 
 
 def training_curve(log: Path, out: Path) -> None:
-    """The low policy's run: reward, tracking and contact by gait, terrain levels (log.jsonl)."""
+    """Plot a run of the low policy: reward, tracking, contact, falls and levels (log.jsonl)."""
     panels: list[tuple[str, dict[str, str] | str]] = [
         ("reward per step", {"reward/total": "total"}),
         ("velocity RMSE (m/s)", {f"tracking/{g}_velocity_rmse": g for g in GAITS}),
@@ -405,9 +417,9 @@ def training_curve(log: Path, out: Path) -> None:
 
 
 def decision_curve(log: Path, out: Path) -> None:
-    """The high policy's run: reward, success, levels and pronk by family (log.jsonl).
+    """Plot a run of the high policy: reward, success, levels and pronk by family (log.jsonl).
 
-    A dotted line is where imitation ends. Until then success is that of the episodes which the
+    A dotted line marks the end of imitation. Until then, success is that of the episodes that the
     teacher does not drive.
     """
     panels: list[tuple[str, dict[str, str] | str]] = [
@@ -420,8 +432,11 @@ def decision_curve(log: Path, out: Path) -> None:
 
 
 def ablation(table: Path, out: Path) -> None:
-    """Success with 95 % intervals of each variant (ablation.json), and of each seed as a dot. A
-    line is at that of ``full``, with which the others are compared, if it is there."""
+    """Plot the success of each variant with 95 % intervals, from ablation.json.
+
+    If a variant has several seeds, each is a dot. If ``full`` is among the variants, a dotted line
+    marks its success for comparison.
+    """
     every: list[dict[str, Any]] = json.loads(table.read_text(encoding="utf-8"))["rows"]
     rows = [row for row in every if "n" in row]
     height = 1.0 + 0.3 * max(len(rows), 1)
@@ -444,8 +459,15 @@ def ablation(table: Path, out: Path) -> None:
 def _curves(
     log: Path, out: Path, panels: Sequence[tuple[str, dict[str, str] | str]], unit: str
 ) -> None:
-    """Panels of (title, {key of a row: label}) against steps; for the families that a run was on, a
-    key with {} in their place is enough."""
+    """Plot panels of log values against steps.
+
+    Args:
+        log: rows of JSON.
+        out: the figure's file.
+        panels: (title, {key of a row: label}) each; instead of the dict, a key with {} stands for
+            one curve per family of the run.
+        unit: label of the x axis.
+    """
     rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     keys = dict.fromkeys(key for row in rows for key in row if key.startswith("level/"))
     families = [key.removeprefix("level/") for key in keys]

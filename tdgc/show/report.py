@@ -1,8 +1,8 @@
-"""One page about an evaluation: files of a results folder in, ``report.html`` out.
+"""One-page report on an evaluation: reads a results folder, writes ``report.html`` into it.
 
-The page needs nothing but itself: pictures and films are inside as data URIs, and its own policy
-(``Content-Security-Policy``) forbids everything else. The template is ``report.html`` beside this
-module; Jinja escapes all that goes into it.
+The page is self-contained: pictures and films are embedded as data URIs, and its
+``Content-Security-Policy`` forbids everything else. The template is ``report.html`` beside this
+module; Jinja escapes every value inserted into it.
 """
 
 import base64
@@ -26,14 +26,14 @@ from tdgc.sim.terrain import file_label
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
 NAME = "report.html"
-#: Bytes of films in a page, a choice: ten of 2 MB each, the size of an MP4 of a whole episode. What
-#: does not fit is named instead.
+#: Limit on the bytes of films in a page, our choice: ten MP4s of whole episodes, about 2 MB each.
+#: Films that do not fit are named instead.
 FILM_BYTES = 24_000_000
 
 Row = dict[str, str]
-_TILE = ("condition", "family", "level", "episode")  # columns that say which tile it was
+_TILE = ("condition", "family", "level", "episode")  # columns that identify a tile
 
-#: Figures of ``tdgc.show.plots``: file, caption, and what is to be seen for those who cannot.
+#: Figures of ``tdgc.show.plots``: file, caption and alternative text.
 FIGURES = (
     (
         "success.png",
@@ -61,9 +61,9 @@ class Film:
 
     Attributes:
         row: of episodes.csv.
-        diagnosis: its row of diagnosis.csv, if there is one.
-        file: the film's name in the results folder, None if there is no film.
-        uri: the film, None if there is none or the page has no room for it.
+        diagnosis: its row of diagnosis.csv, if any.
+        file: name of the film, None if there is no film.
+        uri: the film as a data URI, None if there is no film or no room for it on the page.
         sheet: data URI, or None.
     """
 
@@ -75,11 +75,11 @@ class Film:
 
 
 def data_uri(path: Path) -> str:
-    """A PNG, GIF or MP4 as a data URI.
+    """Encode a PNG, GIF or MP4 as a data URI.
 
     Raises:
-        OSError: it cannot be read.
-        KeyError: a file of another kind.
+        OSError: the file cannot be read.
+        KeyError: the file is of another kind.
     """
     kind = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}[path.suffix]
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
@@ -95,16 +95,15 @@ def _json(path: Path) -> Any:
 
 
 def _distinct(rows: Sequence[Row], column: str) -> list[str]:
-    """What stands in a column, each once, in order."""
+    """Distinct values of a column, in order of appearance."""
     return list(dict.fromkeys(row[column] for row in rows))
 
 
 def _conditions(episodes: Sequence[Row]) -> list[dict[str, Any]]:
-    """Of each condition its name, what it changes, where it was run, how large its cells are, and
-    how each policy's episodes ended.
+    """Describe each condition: its name, changes, families, levels, cell sizes and outcomes.
 
     Raises:
-        ValueError: a condition that there is not.
+        ValueError: an unknown condition.
     """
     result = []
     for name in _distinct(episodes, "condition"):
@@ -130,7 +129,7 @@ def _conditions(episodes: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """A tuning's keys as ``--set`` takes them, with their values."""
+    """Flatten a tuning into keys as in ``--set``, with their values."""
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")
@@ -156,14 +155,14 @@ def _tuning(path: Path) -> dict[str, Any] | None:
 
 
 def film_stem(row: Row) -> str:
-    """The name of the films of a row of episodes.csv or diagnosis.csv."""
+    """Name of the films for a row of episodes.csv or diagnosis.csv."""
     level, episode, seed = (int(row[key]) for key in ("level", "episode", "seed"))
     where = row["policy"], row["condition"], row["family"]
     return EpisodeRecord(*where, level, episode, seed, row["outcome"]).name
 
 
 def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> Film:
-    """What is in ``folder`` of an episode; its film only if it has at most ``room`` bytes."""
+    """Collect an episode's files in ``folder``; a film is embedded if it fits in ``room`` bytes."""
     stem = film_stem(row)
     kinds = (folder / f"film_{stem}.mp4", folder / f"film_{stem}.gif")
     path = next((path for path in kinds if path.is_file()), None)
@@ -178,11 +177,11 @@ def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> Film:
 
 
 def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> list[dict[str, Any]]:
-    """The first filmed tile of each family, with its strip and its films under every policy.
+    """Collect the first filmed tile of each family, with its strip and the films of all policies.
 
     Args:
         folder: ``films/`` of a results folder.
-        episodes: the filmed ones.
+        episodes: those that were filmed.
         diagnoses: of any episodes.
     """
     causes = {film_stem(d): d for d in diagnoses}
@@ -206,14 +205,14 @@ def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> l
 
 
 def render(folder: Path) -> str:
-    """The page about the evaluation whose results are in ``folder``.
+    """Render the page about the evaluation whose results are in ``folder``.
 
-    Of the folder's files summary.json, episodes.csv and the figures must be there. diagnosis.csv,
-    tuning.json and films/ are shown if they are.
+    The folder must contain summary.json, episodes.csv and the figures. diagnosis.csv, tuning.json
+    and films/ are shown if present.
 
     Raises:
         OSError: a file is missing or cannot be read.
-        ValueError: a file holds what an evaluation does not write.
+        ValueError: a file has content that an evaluation does not write.
     """
     written, episodes = _json(folder / "summary.json"), _rows(folder / "episodes.csv")
     summary, paired = policies_of(written), written.get(PAIRED, {})
@@ -254,7 +253,7 @@ def render(folder: Path) -> str:
 
 
 def write(folder: Path) -> Path:
-    """Write ``report.html`` into ``folder``, whole or not at all; its path.
+    """Write ``report.html`` into ``folder`` atomically, and return its path.
 
     Raises:
         OSError, ValueError: as ``render``, or the page cannot be written.

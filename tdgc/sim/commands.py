@@ -1,4 +1,4 @@
-"""The 15 commands and the decoder D from 13 actions (paper Sec. IV-B).
+"""The 15 commands, and the decoder D that maps 13 actions to them (paper Sec. IV-B).
 
 ======  =============  =====  ==================================================
 index   name           unit   meaning
@@ -7,15 +7,15 @@ index   name           unit   meaning
 1       vy             m/s    leftward velocity in the heading frame
 2       yaw_rate       rad/s  turning left is positive
 3       body_height    m      added to the standing height
-4       frequency      Hz     gait cycles a second
+4       frequency      Hz     gait cycles per second
 5       duration       1      duty factor: share of a cycle in stance
 6       swing_height   m      apex of a swing foot above the ground
 7       pitch          rad    nose down is positive
 8       roll           rad    left side up is positive
 9       stance_width   m      between left and right footholds
 10      stance_length  m      between front and rear footholds
-11      power_weight   1/W    price of mechanical power, the auxiliary command
-12-14   phase, offset, bound  the gait's embedding e(g), see ``tdgc.sim.gaits``
+11      power_weight   1/W    weight of mechanical power in the reward (auxiliary)
+12-14   phase, offset, bound  gait embedding e(g), see ``tdgc.sim.gaits``
 ======  =============  =====  ==================================================
 """
 
@@ -33,18 +33,19 @@ NAMES = (*CONTINUOUS, "phase", "offset", "bound")
 UNITS = (
     "m/s", "m/s", "rad/s", "m", "Hz", "1", "m", "rad", "rad", "m", "m", "1/W", "1", "1", "1"
 )  # fmt: skip
-NUM_ACTIONS = len(CONTINUOUS) + 1  # 12 continuous and the gait channel
+NUM_ACTIONS = len(CONTINUOUS) + 1  # 12 continuous ones and the gait channel
 NUM_COMMANDS = len(NAMES)
 #: Position of each command in the vector, by name.
 INDEX = {name: i for i, name in enumerate(NAMES)}
-#: Those that change sign in a left-right mirror.
+#: Commands that change sign in a left-right mirror.
 SIDEWAYS = ("vy", "yaw_rate", "roll")
 
 
 def default_command() -> NDArray[np.float64]:
-    """Standing still in trot with middling behaviour parameters, (15,).
+    """Command to stand still in trot with moderate behaviour parameters, (15,).
 
-    0.08 m of swing and 3 Hz are the defaults of Walk These Ways; footholds under the hips.
+    The swing height of 0.08 m and the frequency of 3 Hz are the defaults of Walk These Ways; the
+    footholds are under the hips.
     """
     command = np.zeros(NUM_COMMANDS)
     command[INDEX["frequency"]] = 3.0
@@ -56,8 +57,9 @@ def default_command() -> NDArray[np.float64]:
     return command
 
 
-#: Unit in which the networks see a command's distance from its default: about half its range, so
-#: that every input spans about [-1, 1]; the embedding enters as it is.
+#: Unit in which the networks see a command's distance from its default, chosen so that inputs stay
+#: within about [-1, 1]; for most commands it is about half the range. The embedding has a default
+#: of 0 here, so its entries become 0 or 1.
 _OBSERVATION_UNIT: NDArray[np.float64] = np.array(
     [1.0, 0.5, 1.0, 0.1, 1.0, 0.1, 0.1, 0.3, 0.2, 0.1, 0.05, 0.002, 0.5, 0.5, 0.5]
 )
@@ -65,19 +67,19 @@ _OBSERVATION_ZERO: NDArray[np.float64] = np.concatenate([default_command()[:12],
 
 
 def observed_command(command: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Commands (..., 15) as the low policy's network sees them."""
+    """Normalise commands (..., 15) as the low policy's network sees them."""
     return np.asarray((command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT)
 
 
 class CommandDecoder:
-    """D: 13 actions -> 15 commands, affine within explicit bounds (paper Sec. IV-B).
+    """The decoder D from 13 actions to 15 commands, affine with explicit bounds (paper Sec. IV-B).
 
     Attributes:
         names: the 15 command names.
-        low, high: (15,) bounds l_j and u_j; the embedding is within [0, 0.5].
+        low, high: (15,) bounds l_j and u_j; those of the embedding are 0 and 0.5.
         units: the 15 units.
-        action_limit: a_max, the clip of the raw action.
-        gaits: indices of the gaits that the last channel chooses from; all four by default.
+        action_limit: a_max, to which raw actions are clipped.
+        gaits: indices of the gaits that the last action chooses from; all four by default.
     """
 
     names = NAMES
@@ -115,8 +117,10 @@ class CommandDecoder:
         return np.clip(raw, -self.action_limit, self.action_limit) / self.action_limit
 
     def gait(self, action: ArrayLike) -> NDArray[np.int64]:
-        """g = clip(floor(2 (x_g + 1)), 0, 3): (..., 13) -> (...); of n gaits the same with n / 2
-        and n - 1."""
+        """g = clip(floor(2 (x_g + 1)), 0, 3): (..., 13) -> (...).
+
+        With n gaits, n / 2 replaces 2, n - 1 replaces 3, and the result indexes ``gaits``.
+        """
         x = self.normalise(action)[..., -1]
         n = len(self.gaits)
         place = np.clip(np.floor(0.5 * n * (x + 1.0)), 0, n - 1).astype(np.int64)
@@ -134,11 +138,11 @@ class CommandDecoder:
         return np.concatenate([continuous, gait_embedding(self.gait(action))], axis=-1)
 
     def encode(self, command: ArrayLike) -> NDArray[np.float64]:
-        """The action in the middle of those that decode to ``command``: (..., 15) -> (..., 13).
+        """The midpoint of all actions that decode to ``command``: (..., 15) -> (..., 13).
 
         Raises:
-            ValueError: a command outside the bounds, named with them, or a gait that is none of
-                ``gaits``.
+            ValueError: a command outside its bounds, which the message names, or a gait that is not
+                one of ``gaits``.
         """
         c = np.asarray(command, dtype=np.float64)
         for j, name in enumerate(CONTINUOUS):
@@ -159,8 +163,10 @@ class CommandDecoder:
         return self.action_limit * np.concatenate([x, gait], axis=-1)
 
     def nearest(self, command: ArrayLike) -> NDArray[np.float64]:
-        """The command next to one that may be outside the bounds: (..., 15) -> (..., 15). Where its
-        gait is none of ``gaits``, it has the first of them."""
+        """The nearest command within the bounds: (..., 15) -> (..., 15).
+
+        A gait that is not one of ``gaits`` becomes the first of them.
+        """
         c = np.clip(np.asarray(command, dtype=np.float64), self.low, self.high)
         gait = gait_index(c)
         known = np.isin(gait, self.gaits)

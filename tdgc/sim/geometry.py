@@ -1,9 +1,9 @@
-"""The robot's geometry, read from its URDF, and what a URDF must be like to be read.
+"""The robot's geometry, read from its URDF, and the checks that the URDF must pass.
 
-The kinematics (``tdgc.sim.robot``) know one kind of robot: a trunk with four equal legs, mirrored
-left to right, each with a hip that turns about the axis ahead and a thigh and a calf that turn
-about the one to the left; at zero the legs are straight down. What does not fit is refused here,
-since Bullet would simulate it and everything computed beside Bullet would be wrong without a word.
+The kinematics (``tdgc.sim.robot``) handle one kind of robot: a trunk with four equal legs, mirrored
+left to right. The hip turns about the forward axis, the thigh and the calf about the leftward axis;
+at zero the legs point straight down. A robot that does not fit is refused here: Bullet would
+simulate it, but everything computed outside Bullet would be silently wrong.
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from tdgc.sim.urdf import JOINTS, Part, Urdf, called, link_of, mass, named, numb
 
 Array = NDArray[np.float64]
 
-#: Which way is out from the trunk's centre for each leg: front + and rear -, left + and right -.
+#: Outward direction of each leg from the trunk's centre: front + and rear -, left + and right -.
 FRONT: Array = np.array([1.0 if leg[0] == "F" else -1.0 for leg in FEET])
 SIDE: Array = np.array([1.0 if leg[1] == "L" else -1.0 for leg in FEET])
 
-_SAME = 1e-6  # m and rad: what is left of arithmetic where a URDF was generated
-#: Of each joint: its axis, and the coordinates in which it may lie away from its parent's.
+_SAME = 1e-6  # m and rad: tolerance for rounding errors in a generated URDF
+#: Axis of each joint, and the coordinates in which its origin may differ from its parent's.
 _AXES = {"hip": (1.0, 0.0, 0.0), "thigh": (0.0, 1.0, 0.0), "calf": (0.0, 1.0, 0.0)}
 _FREE = {"hip": (True, True, False), "thigh": (False, True, False), "calf": (False, False, True)}
 _PLACES = {
@@ -35,18 +35,18 @@ _PLACES = {
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What the kinematics, rewards and exports need to know of a robot.
+    """What the kinematics, rewards and exports need to know about a robot.
 
     Attributes:
-        hips: hip joints in the trunk's frame, (4, 2) m ahead and to the left.
+        hips: positions of the hip joints in the trunk's frame, (4, 2) m forward and left.
         abduction: m, from the hip joint out to the thigh joint.
-        thigh, calf: m, from the thigh joint to the calf joint, and on to the foot's centre.
+        thigh, calf: m, from the thigh joint to the calf joint, and from there to the foot's centre.
         foot_radius: m.
-        trunk_mass: kg, with what is fixed to the trunk.
+        trunk_mass: kg, including what is fixed to the trunk.
         masses: kg of each link, by name.
         joint_limits: lowest and highest angle of each joint, (12, 2) rad.
-        motor_limits: torque in N m and speed in rad/s of hip, thigh and calf, (2, 3), the least of
-            the four legs; infinite where the URDF says nothing.
+        motor_limits: torque in N m and speed in rad/s of hip, thigh and calf, (2, 3), the lowest of
+            the four legs; infinite where the URDF gives none.
     """
 
     hips: Array
@@ -61,14 +61,14 @@ class Geometry:
 
 
 def read_geometry(config: RobotConfig) -> Geometry:
-    """The geometry of the robot whose URDF ``config`` names.
+    """Read the geometry of the robot whose URDF ``config`` names.
 
-    It is read at each call: a world reads it once and keeps it. docs/robot.md says what a URDF
-    must have.
+    Every call reads the file; a world reads it once and keeps the result. docs/robot.md lists what
+    a URDF must have.
 
     Raises:
-        ConfigError: a file that is not there, cannot be read or is no robot of this kind; the
-            message says what is wrong with it and what is allowed.
+        ConfigError: a file that is missing, cannot be read or does not describe a robot of this
+            kind; the message says what is wrong with it and what is allowed.
     """
     urdf = read_urdf(config)
     with named(urdf.path):
@@ -80,7 +80,7 @@ def _measure(urdf: Urdf) -> Geometry:
     origins = np.stack([_origin(joints[name]) for name in JOINTS]).reshape(4, 3, 3)
     limits = np.stack([_limits(joints[name]) for name in JOINTS]).reshape(4, 3, 2)
     feet = np.stack([_foot(parts[link_of(joints[f"{leg}_calf_joint"], "child")]) for leg in FEET])
-    # Left legs as they are, right ones in a mirror.
+    # Right legs are mirrored, so that they can be compared with the left ones.
     mirrored = origins * np.stack([np.ones(4), SIDE, np.ones(4)], axis=1)[:, None]
     turned = np.where(SIDE[:, None] > 0.0, limits[:, 0], -limits[:, 0, ::-1])
     for k, leg in enumerate(FEET):
@@ -118,7 +118,7 @@ def _measure(urdf: Urdf) -> Geometry:
 
 
 def _origin(joint: Element) -> Array:
-    """Where a joint is in its parent's frame, (3,) m; the axes are checked, too."""
+    """Position of a joint in its parent's frame, (3,) m; its type and axis are checked as well."""
     name = joint.get("name", "")
     leg, part = name.split("_")[:2]
     axis = numbers(joint, "axis", "xyz", "1 0 0")
@@ -146,7 +146,7 @@ def _limits(joint: Element) -> Array:
 
 
 def _motor_limit(joint: Element, key: str) -> float:
-    """Torque (``effort``) or speed (``velocity``) that a joint's motor ends at; 0 means none."""
+    """Torque (``effort``) or speed (``velocity``) limit of a joint's motor; infinite if it is 0."""
     value = float(numbers(joint, "limit", key, "0", 1)[0])
     if value < 0.0:
         raise ConfigError(f"{called(joint)}: limit {key} must be at least 0, not {value:g}")
@@ -154,7 +154,7 @@ def _motor_limit(joint: Element, key: str) -> float:
 
 
 def _foot(parts: list[Part]) -> Array:
-    """Height in the calf's frame and radius of the foot, (2,) m."""
+    """Height of the foot in the calf's frame and its radius, (2,) m."""
     calf = parts[0].link
     shapes = [
         (part.place + part.rotation @ numbers(shape, "origin", "xyz", "0 0 0"), shape)

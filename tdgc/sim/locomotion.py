@@ -1,9 +1,9 @@
-"""The executor that both policies share: robots in a world, driven by commands and actions.
+"""The executor shared by both policies: robots in a world, driven by commands and actions.
 
 ``Locomotion`` turns the low policy's actions into joint targets, keeps the phase clock and the
 histories, applies domain randomisation and builds the low policy's observation s^L of Sec. IV-A. It
-knows nothing of rewards or tasks; ``tdgc.tasks.low_env`` trains on it and ``tdgc.tasks.high_env``
-drives it.
+knows nothing about rewards or tasks: ``tdgc.tasks.low_env`` trains the low policy on it, and
+``tdgc.tasks.high_env`` drives it.
 """
 
 import dataclasses
@@ -33,29 +33,29 @@ from tdgc.sim.terrain import TileField
 from tdgc.sim.world import World
 from tdgc.state import State, copies, fill
 
-SPEED_SCALE = 0.05  # s/rad, joint speed as the networks see it (Walk These Ways)
-GYRO_SCALE = 0.25  # s/rad, angular velocity likewise
+SPEED_SCALE = 0.05  # s/rad, scale of joint speeds in the observation (Walk These Ways)
+GYRO_SCALE = 0.25  # s/rad, scale of angular velocity in the observation
 _FREQUENCY = INDEX["frequency"]
-_HISTORY = 3  # control steps of targets kept: the step, and two before for latency up to 40 ms
+_HISTORY = 3  # control steps of targets kept: the current and two before, for latency up to 40 ms
 
 
 def check_randomisation(
     config: RandomisationConfig, physics: PhysicsConfig, trunk_mass: float
 ) -> None:
-    """See that what is drawn is physical, and latencies no longer than joint targets are kept.
+    """Check that the ranges are physical, and latencies no longer than joint targets are kept.
 
     Args:
-        config: what is drawn, ``scale`` included.
-        physics: has the nominal friction, and the time of a control step.
+        config: the ranges and their ``scale``.
+        physics: provides the nominal friction and the duration of a control step.
         trunk_mass: kg.
 
     Raises:
-        ConfigError: a range that is not; says what is allowed.
+        ConfigError: a range outside what is allowed; the message names the limits.
     """
     kept, any_more = (_HISTORY - 1) * physics.control_dt, float("inf")
-    allowed = {  # nominal value, least and greatest
+    allowed = {  # nominal, least and greatest value
         "friction": (physics.friction, 0.0, any_more),
-        "payload": (0.0, -0.9 * trunk_mass, any_more),  # Bullet wants some mass to be left
+        "payload": (0.0, -0.9 * trunk_mass, any_more),  # leave some mass for Bullet
         "motor_strength": (1.0, 0.0, any_more),
         "latency": (0.0, 0.0, kept),
         "armature": (0.0, 0.0, any_more),
@@ -73,17 +73,20 @@ def check_randomisation(
 class Locomotion:
     """M robots that take 12 actions each control step and follow 15 commands.
 
-    They are in a new Bullet world, or in ``world`` if there is one.
+    They live in ``world``, or in a new Bullet world if that is None.
 
     Attributes:
         command: (M, 15), to be set by the caller.
         actions: (2, M, 12), the last clipped action and the one before.
-        targets: (3, M, 12) rad, joint targets of the last step and the two before.
-        carried_out: (M, 15), what ``executed`` was in the last control step.
-        frequency_limit: Hz, that the start of a gait is not hurried beyond.
-        layout: terms of ``observe``'s rows.
-        delay: (M,) s of latency; joint_offset: (M, 12) rad; friction, payload: (M,); armature:
-            (M,) kg m^2.
+        targets: (3, M, 12) rad, joint targets of the last control step and the two before.
+        carried_out: (M, 15), ``executed`` commands of the last control step.
+        frequency_limit: Hz, cap on the robot's ``start_frequency``.
+        layout: terms of the observation.
+        delay: (M,) s, latency.
+        joint_offset: (M, 12) rad, error of each joint's zero.
+        friction: (M,), coefficient of friction.
+        payload: (M,) kg on the trunk.
+        armature: (M,) kg m^2, rotor inertia of each joint.
     """
 
     def __init__(
@@ -117,16 +120,19 @@ class Locomotion:
         # Feet in the nominal pose, (1, 4, 3) m.
         self._feet, _ = foot_kinematics(geometry, self.nominal[None], np.zeros((1, NUM_JOINTS)))
         self._stand = nominal_height(robot, geometry)
-        self._pose = self._pose_of = np.empty(0)  # the last ``pose`` and what it followed from
+        self._pose = self._pose_of = np.empty(0)  # cached ``pose`` and what it was computed from
 
     def swing(self) -> Array:
-        """Profile of the swing, (M, 4): height of each foot as a share of the commanded apex."""
+        """Swing profile, (M, 4): height of each foot as a share of the commanded apex."""
         return self.clock.swing(self.robot.swing_ramp)
 
     def executed(self) -> Array:
-        """The commands as they are carried out now, (M, 15): a gait begins no slower than
-        ``start_frequency``, unless ``frequency_limit`` is lower. At 2 Hz pronk and bound fly for a
-        quarter of a second, and a robot's first jump is too weak for that."""
+        """Commands as they are carried out now, (M, 15).
+
+        A gait begins at ``start_frequency`` or faster, unless ``frequency_limit`` is lower, and
+        slows to the commanded frequency over ``start_cycles``. At 2 Hz pronk and bound have a
+        flight phase of a quarter of a second, and a robot's first jump is too weak for that.
+        """
         begun, asked = self.clock.begun(self.robot.start_cycles), self.command[:, _FREQUENCY]
         command = self.command.copy()
         least = min(self.robot.start_frequency, self.frequency_limit)
@@ -134,10 +140,10 @@ class Locomotion:
         return command
 
     def pose(self) -> Array:
-        """q0, the pose that actions start from and joint errors refer to, (M, 12) rad."""
+        """q0, the pose to which actions are added and joint errors refer, (M, 12) rad."""
         if not self.robot.commanded_pose:
             return np.tile(self.nominal, (self.num_robots, 1))
-        # An action is taken from the pose that was observed, if nobody changed anything between.
+        # ``act`` reuses the pose of the observation, unless commands or clocks changed in between.
         follows = np.column_stack([self.command, self.clock.clock, self.clock.cycles])
         if not np.array_equal(follows, self._pose_of):
             geometry = self.world.state.geometry
@@ -150,8 +156,10 @@ class Locomotion:
         return self._pose
 
     def _walking_pose(self, geometry: Geometry) -> Array:
-        """What joints should reach in the middle of the coming control step, for which they need
-        the time that they trail a moving target by, kd / kp."""
+        """Pose that the joints should reach in the middle of the coming control step.
+
+        Joints lag a moving target by kd / kp, so the feet are placed for that much later.
+        """
         command, middle = self.executed(), 0.5 * self.physics.control_dt
         phases, ahead = (
             foot_phases(
@@ -165,8 +173,8 @@ class Locomotion:
         return walking_pose(self.robot, geometry, command, phases, ahead, grown)
 
     def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:
-        """Stand the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)
-        rad, with their clocks at ``clock`` (n,), and forget their histories."""
+        """Place the robots ``index`` (n,) in the nominal pose at ``xy`` (n, 2) m, ``yaw`` (n,)
+        rad, with their clocks at ``clock`` (n,), and clear their histories."""
         ground = self.world.ground_height(*to_world(xy, yaw, self._feet)).max(axis=1)
         position = np.column_stack([xy, ground + self._stand])
         pose = np.tile(self.nominal, (len(index), 1))
@@ -183,12 +191,12 @@ class Locomotion:
         rng: np.random.Generator,
         width: Array | float = 1.0,
     ) -> None:
-        """Draw the physical parameters of the robots ``index`` about their nominal values.
+        """Draw the physical parameters of the robots ``index`` around their nominal values.
 
-        ``width`` (n,) scales each robot's ranges, as ``config.scale`` does all.
+        ``width`` (n,) scales the ranges of each robot, in addition to ``config.scale`` for all.
 
         Raises:
-            ConfigError: as ``check_randomisation``.
+            ConfigError: see ``check_randomisation``.
         """
         n = len(index)
         check_randomisation(config, self.physics, self.world.state.geometry.trunk_mass)
@@ -208,19 +216,19 @@ class Locomotion:
         self.apply_dynamics(index)
 
     def apply_dynamics(self, index: NDArray[np.integer]) -> None:
-        """Bring friction, payload and armature of the robots ``index`` into Bullet."""
+        """Set friction, payload and armature of the robots ``index`` in the world."""
         self.world.set_dynamics(
             index, self.friction[index], self.payload[index], self.armature[index]
         )
 
     def act(self, actions: NDArray[np.floating]) -> None:
-        """One control step: clip, scale, delay, PD control in Bullet, clock (Sec. IV-A).
+        """Run one control step: clip, scale, delay, PD control, clock (Sec. IV-A).
 
         Args:
             actions: (M, 12).
 
         Raises:
-            ValueError: a value that is not finite.
+            ValueError: an action that is not finite.
         """
         if not np.isfinite(actions).all():
             raise ValueError("an action must be finite; it has NaN or infinite values")
@@ -240,7 +248,7 @@ class Locomotion:
         )
 
     def _arrays(self) -> dict[str, Array]:
-        """All that one step leaves for the next but what Bullet remembers of contacts."""
+        """Everything that a step passes on to the next, except Bullet's memory of contacts."""
         fields = dataclasses.fields(self.world.state)
         measured = [f.name for f in fields if f.init and f.name != "geometry"]
         return {
@@ -261,14 +269,14 @@ class Locomotion:
         }
 
     def state_dict(self) -> State:
-        """Everything of the robots, as copies; the ground is the caller's."""
+        """Copies of the robots' complete state; saving the terrain is up to the caller."""
         return copies(self._arrays())
 
     def load_state_dict(self, state: State) -> None:
-        """Go on from a ``state_dict``, as a ``World.forget`` there would have gone on.
+        """Restore a ``state_dict``; continues as the original does after ``World.forget``.
 
         Raises:
-            ValueError: a state of other robots.
+            ValueError: the state lacks an array or has one of another shape.
         """
         fill(self._arrays(), state)
         self.world.state.derive()
@@ -277,8 +285,8 @@ class Locomotion:
         self.world.forget()
 
     def observe(self, noise: Noise | None = None) -> NDArray[np.float32]:
-        """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g] and the rest of ``actor_layout``, (M,
-        n); what is measured carries the ``noise``."""
+        """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g] and the rest of ``actor_layout``,
+        (M, n); ``noise`` is added to measured terms."""
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
         return observe(self.layout, self, noise)
 
@@ -318,13 +326,13 @@ _ACTOR_LAYOUT: tuple[Term[Locomotion], ...] = (
 # fmt: on
 
 
-# Where joint errors refer to a pose that walks, they do not say how the legs stand, nor does the
-# sine of a phase tell the beginning of a stance from its end.
+# Joint errors from a walking pose do not determine the joint angles, and the sine of a phase does
+# not distinguish the beginning of a stance from its end, so these two terms are added.
 _OF_WALKING = ("pose", "clock_cosine")
 
 
 def actor_layout(robot: RobotConfig, gyro: bool) -> tuple[Term[Locomotion], ...]:
-    """s^L of Sec. IV-A, the actor's observation: 71 values, 3 more with a gyro and 16 more where
-    the nominal pose walks."""
+    """Terms of s^L of Sec. IV-A, the actor's observation: 71 values, 3 more with a gyro and 16 more
+    with ``robot.commanded_gait``."""
     absent = (() if gyro else ("gyro",)) + (() if robot.commanded_gait else _OF_WALKING)
     return tuple(term for term in _ACTOR_LAYOUT if term.name not in absent)

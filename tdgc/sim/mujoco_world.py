@@ -1,7 +1,7 @@
 """A robot on its tile in MuJoCo: the only module that imports mujoco.
 
-Robot, ground and joint control are those of the Bullet world: the same URDF, the same surface and
-the same PD law. Contacts, integration and the motors' rotors are MuJoCo's.
+Robot, ground and joint control match the Bullet world: the same URDF, the same surface and the same
+PD law. Contacts, integration and the rotor inertia of the motors are MuJoCo's.
 """
 
 import contextlib
@@ -25,35 +25,36 @@ from tdgc.sim.world import WindowError, World, check_display
 
 _CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
 _NAME = "ground"
-_BASE = 0.5  # m of ground under its lowest point: MuJoCo's height fields are solid
-# Parts that a geom belongs to: the ground, the trunk, a foot, a leg above it (plus 0-3 each).
+_BASE = 0.5  # m of ground below its lowest point: MuJoCo's height fields are solid
+# Codes of the part that a geom belongs to: ground, trunk, a foot, a leg above it (the last two
+# plus the leg's index, 0-3).
 _GROUND, _TRUNK, _FOOT, _LEG = -1, 0, 1, 5
 
 
 @dataclass(frozen=True)
 class MujocoConfig:
-    """MuJoCo's settings; docs/mujoco.md has what each costs."""
+    """MuJoCo's settings; docs/mujoco.md gives the reason for each."""
 
     timestep: float = 0.0025  # s, Bullet's on terrain
-    # s, time constant of contacts and joint limits. At MuJoCo's default of 0.02 s feet get 3-4 cm
+    # s, time constant of contacts and joint limits. At MuJoCo's default of 0.02 s feet sink 3-4 cm
     # into the ground, past their centres, and stay there.
     solref: float = 0.005
-    # With friction pyramids and MuJoCo's impratio of 1 feet creep down slopes.
+    # With pyramidal cones and MuJoCo's default impratio of 1, feet creep down slopes.
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
     impratio: float = 100.0
     friction: float = 0.8  # foot on ground, nominal (benchmark)
-    armature: float = 0.01  # kg m^2, rotor of each joint's motor: as in models of such robots
-    joint_friction: float = 0.0  # N m in each joint, dry
+    armature: float = 0.01  # kg m^2, rotor inertia of each joint, as in models of such robots
+    joint_friction: float = 0.0  # N m, dry friction of each joint
 
     def physics(self, control_dt: float, joint_rate: float) -> PhysicsConfig:
-        """The steps of control, joint control and physics.
+        """Time steps of control, joint control and physics.
 
         Args:
-            control_dt: s, a control step.
-            joint_rate: Hz at which joint torques are computed.
+            control_dt: s, duration of a control step.
+            joint_rate: Hz, rate at which joint torques are computed.
 
         Raises:
-            ConfigError: ``timestep`` does not divide the joint control's step.
+            ConfigError: ``timestep`` does not divide the step of the joint control.
         """
         joint_dt = 1.0 / joint_rate
         substeps, hold = round(control_dt / self.timestep), round(joint_dt / self.timestep)
@@ -69,15 +70,15 @@ class MujocoConfig:
 class MujocoWorld(World):
     """One robot on the only tile of a field, simulated by MuJoCo instead of Bullet.
 
-    It does what an episode asks of a ``World``. What training asks beyond that it cannot do: other
-    terrain, forgetting, pictures.
+    It supports what an episode needs of a ``World``, but not changing the terrain, ``forget`` and
+    ``picture``.
 
     Args:
         robot: its URDF, gains and limits.
-        physics: from ``config``.
+        physics: as returned by ``config.physics``.
         field: (1, 1) tiles.
         config: MuJoCo's settings.
-        visual: keep what only a window shows.
+        visual: keep shapes that only a window shows.
 
     Raises:
         ConfigError: a URDF that MuJoCo cannot load.
@@ -105,14 +106,14 @@ class MujocoWorld(World):
         self._armature = config.armature
 
     def _parts(self) -> NDArray[np.int64]:
-        """What each geom is part of, as codes of this module."""
+        """Code of the part that each geom belongs to."""
         model = self.model
-        carrier = model.body_weldid[model.geom_bodyid]  # what is fixed to a link belongs to it
+        carrier = model.body_weldid[model.geom_bodyid]  # bodies fixed to a link count as that link
         parts = np.where(model.geom_bodyid == 0, _GROUND, _TRUNK)
         for k, name in enumerate(JOINTS):
             parts[carrier == model.joint(name).bodyid[0]] = _LEG + k // 3
         mujoco.mj_kinematics(model, self.data)
-        feet = self.state.foot_body[0]  # at joint angles 0 and the trunk at the origin, as there
+        feet = self.state.foot_body[0]  # trunk at the origin, joint angles 0, as in ``data``
         for leg in range(4):
             mine = np.flatnonzero((parts == _LEG + leg) & (model.geom_contype > 0))
             away = np.linalg.norm(self.data.geom_xpos[mine] - feet[leg], axis=1)
@@ -120,7 +121,7 @@ class MujocoWorld(World):
         return parts
 
     def _put(self, i: int) -> None:
-        """Bring the robot of MuJoCo to where ``state`` has it."""
+        """Set MuJoCo's robot to its pose and velocities in ``state``."""
         state, data = self.state, self.data
         mujoco.mj_resetData(self.model, data)
         data.qpos[:3], data.qpos[3:7] = state.position[i], np.roll(state.quaternion[i], 1)
@@ -128,7 +129,7 @@ class MujocoWorld(World):
         self._move_trunk(i)
 
     def _move_trunk(self, i: int) -> None:
-        """Let the trunk move as ``state`` has it."""
+        """Give the trunk its velocities in ``state``."""
         state, velocity = self.state, self.data.qvel
         turn = rotation_matrix(state.quaternion)[i].T
         velocity[:3], velocity[3:6] = state.lin_vel[i], turn @ state.ang_vel[i]
@@ -136,19 +137,19 @@ class MujocoWorld(World):
     def set_dynamics(
         self, index: ArrayLike, friction: Array, payload: Array, armature: Array
     ) -> None:
-        """As ``World.set_dynamics``; ``armature`` (1,) kg m^2 comes on top of the settings'."""
+        """As ``World.set_dynamics``; ``armature`` (1,) kg m^2 is added to that of the settings."""
         model, (mass, inertia) = self.model, self._trunk
-        share = (mass + payload) / mass  # spread over the trunk, the payload scales its inertia
+        share = (mass + payload) / mass  # the payload is spread over the trunk: inertia scales too
         model.body(1).mass, model.body(1).inertia = share * mass, share * inertia
-        model.geom_friction[:, 0] = friction[0]  # of two in contact MuJoCo takes the larger
+        model.geom_friction[:, 0] = friction[0]  # MuJoCo takes the larger of two in contact
         model.dof_armature[self._qd] = self._armature + armature
-        mujoco.mj_setConst(model, mujoco.MjData(model))  # it leaves the robot elsewhere
+        mujoco.mj_setConst(model, mujoco.MjData(model))  # on scratch data, as it moves the robot
 
     def retire(self, index: ArrayLike) -> None:
-        """The robot's episode has ended, and this world has no other robot."""
+        """Do nothing: the episode of the only robot has ended."""
 
     def step(self, targets: Array, delay: Array, offset: Array) -> None:
-        """One control step of PD control, as ``World.step``."""
+        """Simulate one control step of PD control, as ``World.step``."""
         model, data, state = self.model, self.data, self.state
         state.trunk_force = np.zeros(1)
         for target in self._wanted(targets, delay, offset):
@@ -167,7 +168,7 @@ class MujocoWorld(World):
         state.derive()
 
     def _contact_force(self) -> Array:
-        """Normal force of the last physics step on the trunk, the feet and the legs, (9,) N."""
+        """Normal force on the trunk, the feet and the legs in the last physics step, (9,) N."""
         force, wrench = np.zeros(_LEG + 4), np.zeros(6)
         parts = self._part[self.data.contact.geom].max(axis=1)  # the robot's, not the ground's
         for k, part in enumerate(parts):
@@ -176,27 +177,27 @@ class MujocoWorld(World):
         return force
 
     def close(self) -> None:
-        """Nothing of MuJoCo needs to be closed."""
+        """Do nothing: MuJoCo has nothing to close."""
 
 
 def _build(
     robot: RobotConfig, field: TileField, config: MujocoConfig, visual: bool
 ) -> mujoco.MjModel:
-    """The robot above its ground."""
+    """Model of the robot and its ground."""
     path = urdf_path(robot)
     try:
         spec = _with_visuals(path) if visual else mujoco.MjSpec.from_file(str(path))
-        spec.compiler.fusestatic = False  # it would weld the trunk to the world
+        spec.compiler.fusestatic = False  # True would weld the trunk to the world
         spec.worldbody.first_body().add_freejoint()
         _add_ground(spec, field)
         _set(spec, config)
         return spec.compile()
-    except ValueError as error:  # a mesh that is not there, an element it cannot read
+    except ValueError as error:  # a missing mesh, an element it cannot read
         raise ConfigError(f"{path}: MuJoCo cannot load it: {error}") from error
 
 
 def _with_visuals(urdf: Path) -> mujoco.MjSpec:
-    """The robot with its visual shapes, which MuJoCo would leave out; but for those of meshes."""
+    """The robot with the visual shapes that MuJoCo discards by default, except meshes."""
     tree = ElementTree.fromstring(urdf.read_text(encoding="utf-8"))
     for link in tree.iter("link"):
         for shape in link.findall("visual"):
@@ -208,14 +209,17 @@ def _with_visuals(urdf: Path) -> mujoco.MjSpec:
 
 
 def _add_ground(spec: mujoco.MjSpec, field: TileField) -> None:
-    """The field's surface. MuJoCo splits a cell along the other diagonal than Bullet, up to 5 mm
-    apart on rough ground, so the field is turned by a quarter: its columns are along y, and its
-    rows against x."""
+    """Add the field's surface.
+
+    MuJoCo and Bullet split a cell along different diagonals, and their surfaces would differ by up
+    to 5 mm on rough ground. So the field is rotated by a quarter turn: its columns run along y, its
+    rows against x.
+    """
     half_x, half_y = 0.5 * field.cell * (np.array(field.heights.shape) - 1)
     low, high = float(field.heights.min()), float(field.heights.max())
     spec.add_hfield(
         name=_NAME,
-        size=[half_y, half_x, high - low or _BASE, _BASE],  # a plane has no heights to scale
+        size=[half_y, half_x, high - low or _BASE, _BASE],  # flat ground has nothing to scale
         nrow=field.heights.shape[0],
         ncol=field.heights.shape[1],
         userdata=field.heights[::-1].ravel().astype(np.float64),
@@ -233,20 +237,20 @@ def _add_ground(spec: mujoco.MjSpec, field: TileField) -> None:
 
 
 def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
-    """Bring the settings into the model."""
+    """Apply the settings to the model."""
     option = spec.option
     option.timestep, option.gravity = config.timestep, [0.0, 0.0, -GRAVITY]
     option.cone, option.impratio = _CONES[config.cone], config.impratio
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]  # the window's only light
     for geom in spec.geoms:
         geom.solref, geom.condim = [config.solref, 1.0], 3
-        geom.friction[0] = config.friction  # of two in contact MuJoCo takes the larger
-        if geom.name != _NAME:  # a robot meets the ground and not itself, as in Bullet
+        geom.friction[0] = config.friction  # MuJoCo takes the larger of two in contact
+        if geom.name != _NAME:  # as in Bullet, a robot collides only with the ground
             geom.conaffinity = 0
     for joint in spec.joints:
         if joint.name not in JOINTS:
             continue
-        # All that moves a joint beside its torque is told here, whatever the URDF says.
+        # Everything that acts on a joint besides its torque is set here and overrides the URDF.
         joint.armature, joint.frictionloss = config.armature, config.joint_friction
         joint.damping = [0.0, 0.0, 0.0]
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -254,7 +258,7 @@ def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
 
 
 class Window:
-    """A ``Watcher`` that shows an episode in MuJoCo's viewer, as fast as it happens.
+    """A ``Watcher`` that shows an episode in MuJoCo's viewer in real time.
 
     Raises:
         WindowError: no display, or the window was closed.

@@ -1,6 +1,6 @@
-"""Observations as tables of terms: what is read, its scale, its noise, its look in a mirror.
+"""Observations as tables of terms: what each one reads, its scale, noise and mirror image.
 
-A layout is a tuple of terms in order; rows, sizes, columns and mirrors follow from it.
+A layout is an ordered tuple of terms; rows, sizes, columns and mirrors follow from it.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,11 +24,12 @@ class Flip(NamedTuple):
 
 
 def in_place(*sign: float) -> Flip:
-    """Of a vector whose entries stay where they are."""
+    """The flip of a vector whose entries keep their positions."""
     return Flip(tuple(range(len(sign))), sign)
 
 
-#: Of vectors (ahead, left, up), of turning about these axes, and of what each leg or joint has one.
+#: Flips of (forward, left, up) vectors, of rotations about these axes, and of vectors with one
+#: entry per leg or joint.
 ARROW, TURN = in_place(1.0, -1.0, 1.0), in_place(-1.0, 1.0, -1.0)
 LEGS = Flip((1, 0, 3, 2), (1.0,) * 4)
 JOINTS = Flip(tuple(3 * leg + j for leg in LEGS.source for j in range(3)), (-1.0, 1.0, 1.0) * 4)
@@ -36,16 +37,16 @@ JOINTS = Flip(tuple(3 * leg + j for leg in LEGS.source for j in range(3)), (-1.0
 
 @dataclass(frozen=True)
 class Term(Generic[S]):
-    """A part of an observation.
+    """One term of an observation.
 
     Attributes:
-        name: within its layout.
-        size: n, of the network's inputs.
+        name: its name in the layout.
+        size: n, number of network inputs.
         read: source -> (M, n).
-        scale: of the inputs, per unit read.
-        noise: field of ``RandomisationConfig`` with the half-width of its noise, in units read;
-            None where nothing is measured.
-        mirror: how it looks in a left-right mirror; None where that changes nothing.
+        scale: network input per unit read.
+        noise: field of ``RandomisationConfig`` with the half-width of its noise, in the units read;
+            None for a term that is not measured.
+        mirror: its flip in a left-right mirror; None where that changes nothing.
     """
 
     name: str
@@ -57,18 +58,18 @@ class Term(Generic[S]):
 
 
 def width(layout: Sequence[Term[Any]]) -> int:
-    """Inputs altogether."""
+    """Total number of inputs."""
     return sum(term.size for term in layout)
 
 
 def columns(layout: Sequence[Term[Any]]) -> dict[str, slice]:
-    """Where each term is in a row."""
+    """The columns of each term in a row."""
     ends = pairwise(accumulate((term.size for term in layout), initial=0))
     return {term.name: slice(*place) for term, place in zip(layout, ends, strict=True)}
 
 
 def mirror(layout: Sequence[Term[Any]]) -> Flip:
-    """Of whole rows."""
+    """The flip of whole rows."""
     source: list[int] = []
     sign: list[float] = []
     for term in layout:
@@ -82,7 +83,7 @@ def mirror(layout: Sequence[Term[Any]]) -> Flip:
 def observe(
     layout: Sequence[Term[S]], source: S, noise: Noise | None = None
 ) -> NDArray[np.float32]:
-    """Rows of M robots, (M, n), of a network's inputs; what is measured carries the ``noise``."""
+    """Network inputs of M robots, (M, n); measured terms carry the ``noise``."""
     parts = []
     for term in layout:
         value = term.read(source)

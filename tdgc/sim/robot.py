@@ -1,8 +1,7 @@
-"""The robot on arrays: nominal pose, joint PD, leg kinematics and the state.
+"""The robot in plain numpy: nominal pose, joint PD, leg kinematics and state.
 
-Plain numpy; ``tdgc.sim.world`` fills a ``RobotState`` from Bullet and asks ``pd_torque`` for
-torques.
-Every array has a leading axis of M robots. Legs in the order of ``tdgc.sim.gaits.FEET``.
+``tdgc.sim.world`` fills a ``RobotState`` from Bullet and calls ``pd_torque`` for joint torques.
+Arrays have a leading axis of M robots. Legs are in the order of ``tdgc.sim.gaits.FEET``.
 """
 
 from dataclasses import dataclass, field
@@ -22,28 +21,28 @@ Array = NDArray[np.float64]
 NUM_JOINTS = len(JOINTS)
 
 GRAVITY = 9.81  # m/s^2
-HIGHEST_FOOT = -0.1  # m against the hips: no commanded pose folds a leg further
+HIGHEST_FOOT = -0.1  # m relative to the hips: no commanded pose folds a leg further
 
 
 def nominal_pose(config: RobotConfig) -> Array:
-    """q0 of the paper, (12,) rad."""
+    """Nominal joint angles, q0 of the paper, (12,) rad."""
     front, rear = config.nominal_thigh
     thigh = np.where(FRONT > 0, front, rear)
     return np.stack([config.nominal_hip * SIDE, thigh, np.full(4, config.nominal_calf)], 1).ravel()
 
 
 def nominal_height(config: RobotConfig, geometry: Geometry) -> float:
-    """Trunk above the soles in the nominal pose, m."""
+    """Height of the trunk above the soles in the nominal pose, m."""
     feet, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
     return float(geometry.foot_radius - feet[0, :, 2].min())
 
 
 def fitted(config: RobotConfig) -> dict[str, Any]:
-    """Settings for the robot whose URDF ``config`` names, by field: what the URDF says of its
-    motors, and what follows from the shipped robot's settings for one of its size and mass.
+    """Settings for the robot whose URDF ``config`` names, by field: motor limits from the URDF, and
+    the shipped robot's settings scaled to its size and mass.
 
-    It stands at the same share of its nominal pose's height. Gains grow as its weight's torque
-    about the joints, m g l, and damping for the same damping ratio, as m l^1.5.
+    ``base_height`` is the same share of the nominal pose's height. ``kp`` scales with the weight's
+    torque about the joints, m g l, and ``kd`` with m l^1.5, which keeps the damping ratio.
     """
     ours, own = RobotConfig(), read_geometry(config)
     shipped = read_geometry(ours)
@@ -62,14 +61,15 @@ def fitted(config: RobotConfig) -> dict[str, Any]:
 
 
 def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swing: Array) -> Array:
-    """q0(c, phi): the nominal pose bent to the commanded behaviour, (M, 15), (M, 4) -> (M, 12) rad.
+    """q0(c, phi): the nominal pose adapted to the commands, (M, 15), (M, 4) -> (M, 12) rad.
 
-    The feet stand under a level trunk of the commanded height, as wide and long apart as asked, and
-    are raised along ``swing``, the profile of ``gaits.swing_profile``, by what the swing height
-    exceeds its default. At default commands it is the paper's q0, on which a policy hardly learned
-    to follow these commands (docs/experiments.md); pitch and roll it learned. It is where actions
-    start from, not a constraint: a foot out of reach is put at the nearest angles that the calf
-    has, and none comes higher than ``HIGHEST_FOOT``.
+    The feet are under a level trunk at the commanded height, with the commanded stance width and
+    length. They rise along ``swing``, the profile of ``gaits.swing_profile``, by the amount that
+    the commanded swing height exceeds its default. At default commands this is the paper's q0. With
+    the paper's q0 throughout, a policy hardly learned to follow these commands, but it did learn
+    pitch and roll (docs/experiments.md). The pose is the offset of the actions, not a constraint: a
+    foot out of reach gets the nearest angles within the calf's limits, and no foot is higher than
+    ``HIGHEST_FOOT``.
     """
     standing, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
     change = command - default_command()
@@ -83,11 +83,11 @@ def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swin
 
 
 def foot_travel(command: Array, phases: Array, rest: Array) -> Array:
-    """How far feet are from their places at ``rest``, by Raibert's rule: (M, 15), (M, 4),
+    """Displacement of the feet from their positions at ``rest`` by Raibert's rule: (M, 15), (M, 4),
     (M, 4, 2) m -> (M, 4, 2) m in the heading frame.
 
-    Half of what the ground moves under the foot in a stance: ahead at touch-down, behind at
-    lift-off, and back through the swing.
+    A foot leads by half of the ground's travel during a stance at touch-down, trails by as much at
+    lift-off and returns during swing.
     """
     lead = np.abs(1.0 - 2.0 * phases) - 0.5
     stance_time = command[:, INDEX["duration"]] / command[:, INDEX["frequency"]]
@@ -106,20 +106,21 @@ def walking_pose(
     ahead: Array,
     grown: Array,
 ) -> Array:
-    """q0(c, phi) of a robot that walks as it is told to, (M, 12) rad.
+    """q0(c, phi) of a robot that walks as commanded, (M, 12) rad.
 
-    The feet stand under a trunk of the commanded height, pitch and roll, as wide and long apart as
-    asked; they run along Raibert's footholds and rise in swing to the commanded height. On top,
-    the load of the stance feet (``stance_load``) turns the joints by what the joint control needs
-    to carry it. It is where actions start from, not a constraint, see ``commanded_pose``.
+    The feet are under a trunk at the commanded height, pitch and roll, with the commanded stance
+    width and length. They move between Raibert's footholds and rise to the commanded height in
+    swing. On top of that, the joints are offset by the position error that the joint control needs
+    to carry the load of the stance feet (``stance_load``). The pose is the offset of the actions,
+    not a constraint, see ``commanded_pose``.
 
     Args:
-        config: the robot.
-        geometry: the robot's.
-        command: (M, 15), as carried out.
-        phases: (M, 4) of the feet.
-        ahead: (M, 4) the phases that joints reach their targets in.
-        grown: (M,) share of swing and travel so far, where a gait begins.
+        config: the robot's settings.
+        geometry: the robot's geometry.
+        command: (M, 15), commands as carried out.
+        phases: (M, 4) phases of the feet, for the load.
+        ahead: (M, 4) the phases later by the joints' lag, for the feet's positions.
+        grown: (M,) share of swing height and travel, which ramps up as a gait begins.
     """
     standing, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
     change = command - default_command()
@@ -127,7 +128,7 @@ def walking_pose(
     feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * FRONT
     feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * SIDE
     feet[..., :2] += grown[:, None, None] * foot_travel(command, ahead, feet[..., :2])
-    # Without its load a nominal pose stands higher than the robot.
+    # The unloaded nominal pose is higher than the robot stands.
     lift = nominal_height(config, geometry) - config.base_height
     feet[..., 2] += lift - change[:, INDEX["body_height"], None]
     feet[..., 2] += (grown * command[:, INDEX["swing_height"]])[:, None] * swing_profile(ahead)
@@ -141,16 +142,19 @@ def walking_pose(
 
 
 def stance_load(geometry: Geometry, command: Array, phases: Array) -> Array:
-    """Vertical force on each foot that carries the robot, (M, 15), (M, 4) -> (M, 4) N: half a sine
-    over its stance, as large as the feet's mean over a cycle has to be its weight."""
+    """Vertical force on each foot that carries the robot, (M, 15), (M, 4) -> (M, 4) N.
+
+    Half a sine over the stance, scaled such that the feet together carry the robot's weight on
+    average over a cycle.
+    """
     weight = GRAVITY * sum(geometry.masses.values())
     peak = 0.5 * np.pi * weight / (4.0 * command[:, INDEX["duration"], None])
     return np.asarray(peak * np.maximum(np.sin(2.0 * np.pi * phases), 0.0))
 
 
 def load_torque(geometry: Geometry, q: Array, load: Array) -> Array:
-    """What a vertical ``load`` (M, 4) N on the feet does to joints at ``q`` (M, 12) rad, (M, 12)
-    N m: the last row of the feet's Jacobian times the load."""
+    """Joint torques, (M, 12) N m, from a vertical ``load`` (M, 4) N on the feet at joint angles
+    ``q`` (M, 12) rad: the last row of each foot's Jacobian times its load."""
     hip, thigh, calf = np.moveaxis(q.reshape(-1, 4, 3), -1, 0)
     x_thigh, x_calf = geometry.thigh * np.sin(thigh), geometry.calf * np.sin(thigh + calf)
     down = -geometry.thigh * np.cos(thigh) - geometry.calf * np.cos(thigh + calf)
@@ -165,43 +169,43 @@ def action_scale(config: RobotConfig) -> Array:
 
 
 def joint_targets(config: RobotConfig, geometry: Geometry, pose: Array, actions: Array) -> Array:
-    """q* = q0 + alpha clip(a, -a_max, a_max): (M, 12) twice -> (M, 12) rad (Sec. IV-A).
+    """q* = q0 + alpha clip(a, -a_max, a_max): two (M, 12) -> (M, 12) rad (Sec. IV-A).
 
-    Targets keep ``joint_margin`` from the joint limits, as a motor driver would see to.
+    Targets stay ``joint_margin`` away from the joint limits, as a motor driver would ensure.
     """
     clipped = np.clip(actions, -config.action_limit, config.action_limit)
     return np.clip(pose + action_scale(config) * clipped, *target_limits(config, geometry))
 
 
 def target_limits(config: RobotConfig, geometry: Geometry) -> tuple[Array, Array]:
-    """Lowest and highest joint targets, (12,) rad each; infinite where nothing limits them."""
+    """Lowest and highest joint targets, (12,) rad each; infinite if ``joint_margin`` is None."""
     if config.joint_margin is None:
         return np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
     low, high = geometry.joint_limits.T
     return low + config.joint_margin, high - config.joint_margin
 
 
-FRICTION_SPEED = 1.0  # rad/s at which dry friction is whole: a step below it would chatter
+FRICTION_SPEED = 1.0  # rad/s from which dry friction is full; a jump at 0 would chatter
 
 
 def pd_torque(
     error: Array, speed: Array, strength: Array, config: RobotConfig, friction: Array | float = 0.0
 ) -> Array:
-    """Joint torques of the PD law, limited as the motors are, less what the joints' friction takes.
+    """Joint torques of the PD law within the motor limits, minus the joints' dry friction.
 
     Args:
         error: (M, 12) target minus angle, rad.
         speed: (M, 12) joint speed, rad/s.
-        strength: (M, 1) motor strength, times gains and limits.
+        strength: (M, 1) motor strength, a factor on gains and torque limits.
         config: gains and limits.
         friction: (M, 1) N m, dry friction in each joint.
 
     Returns:
-        (M, 12) N m. A joint at its speed limit gets no torque that would drive it faster.
+        (M, 12) N m. A motor at its speed limit applies no torque that would drive it faster.
     """
     limit = np.array(4 * config.torque_limit) * strength
     torque = strength * (config.kp * error - config.kd * speed)
-    np.minimum(torque, limit, out=torque)  # np.clip takes twice as long for so few
+    np.minimum(torque, limit, out=torque)  # np.clip takes twice as long on small arrays
     np.maximum(torque, -limit, out=torque)
     fast = np.abs(speed) >= np.array(4 * config.speed_limit)
     if fast.any():
@@ -212,7 +216,7 @@ def pd_torque(
 
 
 def foot_kinematics(geometry: Geometry, q: Array, qd: Array) -> tuple[Array, Array]:
-    """Foot centres and velocities in the trunk's frame: (M, 12) twice -> (M, 4, 3) twice."""
+    """Foot centres and their velocities in the trunk's frame: two (M, 12) -> two (M, 4, 3)."""
     angle, rate = q.reshape(-1, 4, 3), qd.reshape(-1, 4, 3)
     hip, thigh, knee = angle[..., 0], angle[..., 1], angle[..., 1] + angle[..., 2]
     hip_d, thigh_d, knee_d = rate[..., 0], rate[..., 1], rate[..., 1] + rate[..., 2]
@@ -229,14 +233,14 @@ def foot_kinematics(geometry: Geometry, q: Array, qd: Array) -> tuple[Array, Arr
 
 
 def leg_angles(geometry: Geometry, feet: Array) -> Array:
-    """Joint angles that put the foot centres there, the inverse of ``foot_kinematics``.
+    """Joint angles for given foot centres, the inverse of ``foot_kinematics``.
 
     Args:
-        geometry: the robot's.
+        geometry: the robot's geometry.
         feet: (M, 4, 3) m in the trunk's frame, below the hips.
 
     Returns:
-        (M, 12) rad, each calf within its limits: a leg too short or too long points at its foot.
+        (M, 12) rad, each calf within its limits: a leg that cannot reach its foot points at it.
     """
     upper, lower = geometry.thigh, geometry.calf
     x, y, z = np.moveaxis(feet - np.pad(geometry.hips, ((0, 0), (0, 1))), -1, 0)
@@ -252,7 +256,7 @@ def leg_angles(geometry: Geometry, feet: Array) -> Array:
 
 
 def rotation_matrix(quaternion: Array) -> Array:
-    """Body-to-world rotation of (M, 4) quaternions (x, y, z, w) -> (M, 3, 3)."""
+    """Body-to-world rotation matrices of quaternions (x, y, z, w): (M, 4) -> (M, 3, 3)."""
     x, y, z, w = quaternion.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -263,7 +267,7 @@ def rotation_matrix(quaternion: Array) -> Array:
 
 
 def quaternion_product(one: Array, other: Array) -> Array:
-    """Turn by ``other`` and then by ``one``: quaternions (..., 4) twice -> (..., 4)."""
+    """Rotate by ``other`` and then by ``one``: two quaternions (..., 4) -> (..., 4)."""
     (ax, ay, az, aw), (bx, by, bz, bw) = np.moveaxis(one, -1, 0), np.moveaxis(other, -1, 0)
     return np.stack(
         [
@@ -277,8 +281,8 @@ def quaternion_product(one: Array, other: Array) -> Array:
 
 
 def to_world(xy: Array, yaw: Array, points: Array) -> tuple[Array, Array]:
-    """x and y in the world, (M, n) m each, of ``points`` (n, 2) or (M, n, 2) m in the heading
-    frames of M robots at ``xy`` (M, 2) m and ``yaw`` (M,) rad."""
+    """World x and y, (M, n) m each, of ``points`` (n, 2) or (M, n, 2) m in the heading frames of M
+    robots at ``xy`` (M, 2) m and ``yaw`` (M,) rad."""
     c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
     x = xy[:, :1] + c * points[..., 0] - s * points[..., 1]
     y = xy[:, 1:2] + s * points[..., 0] + c * points[..., 1]
@@ -292,22 +296,23 @@ def yaw_quaternion(yaw: Array) -> Array:
 
 
 def wrap_angle(angle: Array) -> Array:
-    """Angles brought to [-pi, pi)."""
+    """Wrap angles to [-pi, pi)."""
     return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
 @dataclass
 class RobotState:
-    """What Bullet says about M robots after a control step, and what follows from it.
+    """State of M robots as simulated after a control step, and quantities derived from it.
 
     Attributes:
-        geometry: the robots'.
+        geometry: the robots' geometry.
         position, quaternion: trunk in the world, (M, 3) m and (M, 4).
         lin_vel, ang_vel: trunk in the world, (M, 3) m/s and rad/s.
         q, qd, torque: joints, (M, 12) rad, rad/s and N m (torque of the last physics step).
-        foot_force: normal contact force on each foot, (M, 4) N.
-        leg_force: the same on each leg above the foot (hip, knee and calf), (M, 4) N.
-        trunk_force: largest normal force on the trunk in any physics step, (M,) N.
+        foot_force: normal contact force on each foot in the last physics step, (M, 4) N.
+        leg_force: the same on each leg above the foot (hip, thigh and calf), (M, 4) N.
+        trunk_force: largest normal force on the trunk in the control step, (M,) N; in Bullet read
+            once per joint control.
     """
 
     geometry: Geometry
@@ -344,16 +349,16 @@ class RobotState:
 
     @property
     def body_rate(self) -> Array:
-        """Angular velocity in the body frame, as a gyro has it, (M, 3) rad/s."""
+        """Angular velocity in the body frame, as a gyro measures it, (M, 3) rad/s."""
         return np.einsum("mji,mj->mi", self.rotation, self.ang_vel)
 
     def derive(self) -> None:
-        """Fill the fields that follow from the measured ones.
+        """Compute the fields that follow from the simulated ones.
 
-        ``gravity`` is the unit vector of gravity in the body frame, g^b of the paper, (M, 3);
-        ``heading_vel`` the velocity (forward, left, up) in the frame turned by yaw alone, (M, 3);
-        ``foot_body`` the foot centres in the body frame, ``foot_position`` and ``foot_velocity``
-        in the world, (M, 4, 3).
+        ``gravity`` (M, 3) is the unit vector of gravity in the body frame, g^b of the paper.
+        ``heading_vel`` (M, 3) m/s is the velocity (forward, left, up) in the heading frame, which
+        is rotated by yaw alone. ``foot_body``, ``foot_position`` and ``foot_velocity`` (M, 4, 3)
+        are the foot centres in the body frame and in the world, and their velocities in the world.
         """
         self.rotation = rotation_matrix(self.quaternion)
         self.yaw = np.arctan2(self.rotation[:, 1, 0], self.rotation[:, 0, 0])

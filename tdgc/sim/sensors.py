@@ -1,4 +1,4 @@
-"""Noise of the robots' sensors, drawn in training and in the evaluation's condition ``noise``."""
+"""Sensor noise, drawn in training and in the evaluation's ``noise`` condition."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,17 +11,18 @@ from tdgc.sim.robot import Array
 
 
 class Draws(Protocol):
-    """What sensors draw their errors from: ``np.random.Generator``, or ``EpisodeDraws``."""
+    """The source of sensor errors: ``np.random.Generator`` or ``EpisodeDraws``."""
 
     def uniform(self, low: float, high: float, size: tuple[int, ...]) -> Array: ...
 
 
 class EpisodeDraws:
-    """Draws for M robots, each from a generator of its own: an episode's errors follow from its
-    seed, whoever runs beside it.
+    """Draws for M robots, each from a generator of its own.
+
+    The errors of an episode thus depend on its seed alone, not on the robots simulated beside it.
 
     Args:
-        seeds: of the M generators.
+        seeds: seeds of the M generators.
     """
 
     def __init__(self, seeds: Iterable[Sequence[int]]) -> None:
@@ -34,12 +35,12 @@ class EpisodeDraws:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Errors of the sensors: their widths, and what they are drawn from."""
+    """Sensor errors: their widths, and the source they are drawn from."""
 
     config: RandomisationConfig
     draws: Draws
 
     def draw(self, width: float, shape: tuple[int, ...]) -> Array:
-        """Errors of shape ``shape``, (M, ...), uniform within +-``width`` times the config's
+        """Draw errors of shape ``shape``, (M, ...), uniform within +-``width`` times the config's
         scale."""
         return np.asarray(self.config.scale * width * self.draws.uniform(-1.0, 1.0, shape))

@@ -1,15 +1,15 @@
 """Terrain tiles and the curriculum grid (Sec. III-A), in plain numpy.
 
-A tile is a height field h(x, y) of 8 m x 8 m; x is the direction of travel. Along x it reads
+A tile is a height field h(x, y) of 8 m x 8 m; x is the direction of travel. Its layout along x is
 
     0      1.25   1.5                                     6.5   6.75      8 m
     | start | band |             challenge zone            | band | goal |
 
 and one number, the difficulty d, scales one geometric parameter per family (Eq. 1). The parameter
 is exact; the layout is drawn for each tile from its own generator. Ranges and shapes are those of
-TDGC-Bench 2. A tile carries its features (trenches, risers, pillars, slope), so that nobody has to
-look for them in the heights. All lengths are in m, all angles in rad; arrays are indexed [ix, iy],
-so sample [ix, iy] lies at (ix * CELL, iy * CELL).
+TDGC-Bench 2. A tile lists its features (trenches, risers, pillars, slope), so that they need not be
+detected in the heights. All lengths are in m, all angles in rad. Arrays are indexed [ix, iy];
+sample [ix, iy] lies at (ix * CELL, iy * CELL).
 """
 
 import dataclasses
@@ -27,30 +27,30 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 HeightArray = NDArray[np.float32]
 
-#: Edition of TDGC-Bench that these tiles belong to; in the first one layouts were fixed.
+#: Edition of TDGC-Bench that these tiles belong to; the first edition had fixed layouts.
 EDITION = 2
 
-# Families and levels: Sec. III-A; Mixed and the levels past 10 are only ever evaluated on.
+# Families and levels: Sec. III-A. Mixed and the levels above 10 are for evaluation only.
 FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
-#: Families for training that are not of the benchmark: ground of many kinds that has no name, and
+#: Training families outside the benchmark: many kinds of ground without a name of their own, and
 #: the same with trenches before or behind it.
 UNNAMED = CLUTTER, DITCHES = "clutter", "ditches"
 ALL_FAMILIES = (*FAMILIES, "mixed", *UNNAMED)
-#: A family whose name ends so is a file with heights of the user's own, see ``height_map``.
+#: A family name with this ending is the path of a user's height map, see ``height_map``.
 MAP_ENDING = ".npy"
 MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1
 OOD_LEVELS = (11, 12)  # out of distribution, d = 1.1 and 1.2
 MAX_DIFFICULTY = OOD_LEVELS[-1] / MAX_LEVEL
 
 # The tile (TDGC-Bench, "Tile").
-TILE_SIZE = 8.0  # m, both ways; the paper's W
+TILE_SIZE = 8.0  # m, in x and y; the paper's W
 CELL = 0.05  # m, grid resolution
-TILE_SAMPLES = round(TILE_SIZE / CELL) + 1  # 161 a side: both edges carry samples
+TILE_SAMPLES = round(TILE_SIZE / CELL) + 1  # 161 per side: both edges carry samples
 START_END = 1.25  # m, the start platform is x in [0, 1.25], at h = 0
 GOAL_BEGIN = 6.75  # m, the goal platform is x in [6.75, 8], at h = 0
 ZONE = (1.5, 6.5)  # m, the challenge zone in x
 BAND = 0.25  # m, transition band between platform and zone
-TILT_BAND = 0.5  # m, Tilt's wider one, half of it inside the zone
+TILT_BAND = 0.5  # m, Tilt's wider band, half of it inside the zone
 START_X, GOAL_X = 0.75, 7.25  # m
 Y_SPREAD = 1.0  # m, start and goal: y uniform in W/2 +- 1
 YAW_SPREAD = 0.5  # rad, start: yaw uniform in +- 0.5
@@ -62,50 +62,51 @@ PARAMETER_RANGES: dict[str, tuple[float, float]] = {
     "stair": (0.03, 0.15),  # step height h_s, m
     "gap": (0.05, 0.30),  # mean gap width w, m
     "tilt": (0.0, 0.45),  # lateral slope angle theta, rad
-    CLUTTER: (0.02, 0.15),  # greatest step height, m; Stair's at d = 1
+    CLUTTER: (0.02, 0.15),  # greatest step height, m; at d = 1 that of Stair
 }
 
-# What layouts are drawn from, the same at every difficulty (same table).
+# Ranges that layouts are drawn from, the same at every difficulty (same table).
 LATTICES = (0.1, 0.15, 0.2, 0.25, 0.3)  # m, spacing of the Rough noise
 TREAD_CELLS = (5, 8)  # cells, shortest and longest tread: 0.25-0.40 m
-LANDING_CELLS = 6  # cells, the least landing between up and down: 0.30 m
-TRENCHES = (3, 5)  # fewest and most in a whole zone
-TRENCH_SPACING = 0.75  # m, least distance between two centres
-TRENCH_MARGIN = 0.3  # m, least distance of a centre from the ends of the zone
+LANDING_CELLS = 6  # cells, shortest landing between up and down: 0.30 m
+TRENCHES = (3, 5)  # least and greatest number in a whole zone
+TRENCH_SPACING = 0.75  # m, minimum distance between two centres
+TRENCH_MARGIN = 0.3  # m, minimum distance of a centre from the ends of the zone
 TRENCH_DEPTH = 0.6  # m
 PILLAR_DIAMETER = (0.2, 0.4)  # m
 PILLAR_HEIGHT = 0.8  # m
-PILLAR_CLEARANCE = 0.6  # m, free way between any two
+PILLAR_CLEARANCE = 0.6  # m, minimum free space between any two
 
-# Clutter, which is ours: wide enough to hold what robots of this size may meet, and with free ways
-# as wide as between pillars.
-WAVES = 3  # plane waves that its hills add up from
+# Clutter, which is ours. The ranges cover what robots of this size may meet; obstacles leave as
+# much free space as pillars.
+WAVES = 3  # number of plane waves that make up its hills
 WAVE_LENGTH = (1.0, 3.0)  # m
-WAVE_SLOPE = 3.0  # 1/m, times the step height: the steepest slope, 0.45 at d = 1
-PAVING = (0.2, 0.5)  # m, sides of its paving stones
-SLABS = 60  # most slabs and bars
+WAVE_SLOPE = 3.0  # 1/m, steepest slope per step height: a slope of 0.45 at d = 1
+PAVING = (0.2, 0.5)  # m, side lengths of its paving stones
+SLABS = 60  # greatest number of slabs and bars
 SLAB_SIDE = (0.1, 1.0)  # m
-OBSTACLE_DIAMETER = (0.2, 0.6)  # m, posts and pits
-OBSTACLES = (4, 14)  # fewest and most of them
+OBSTACLE_DIAMETER = (0.2, 0.6)  # m, of posts and pits
+OBSTACLES = (4, 14)  # least and greatest number of posts or pits
 WALL_LENGTH = (0.4, 1.2)  # m
-WALLS = (2, 6)
+WALLS = (2, 6)  # least and greatest number
 WALL_THICKNESS = 0.2  # m
 
-# Ditches, ours as well: at its least either part has room for two trenches or four steps.
+# Ditches, ours as well. Even the shortest part has room for two trenches, or for four of Stair's
+# risers.
 SHORTEST_PART = 1.5  # m
 
-# Bullet keeps the height range of a field's first upload, so it is pinned to what any tile can
-# need: Tilt at level 12 reaches W/2 tan(0.54 rad) = 2.40 m either way, everything else less.
+# Bullet keeps the height range of a field's first upload, so it is fixed to what any tile can need:
+# Tilt at level 12 reaches W/2 tan(0.54 rad) = 2.40 m up and down, all other families less.
 HEIGHT_RANGE = (-2.5, 2.5)  # m
-# btHeightfieldTerrainShape cuts larger fields off without a word.
+# btHeightfieldTerrainShape silently truncates larger fields.
 MAX_SAMPLES = 2_097_152
 
-# First entry of every tile's seed: the streams differ here, so no training tile is ever an
-# evaluation tile, whatever the seeds. The values only have to differ.
+# First entry of every tile's seed. It differs between the streams, so that no training tile is ever
+# an evaluation tile, whatever the seeds. Any two different values would do.
 TRAIN_STREAM = 1
 EVAL_STREAM = 2
 
-_X = np.arange(TILE_SAMPLES) / round(1 / CELL)  # m; i / 20 is exact wherever i * 0.05 may not be
+_X = np.arange(TILE_SAMPLES) / round(1 / CELL)  # m; i / 20 rounds correctly, i * 0.05 may not
 _PLANE: FloatArray = np.stack(np.meshgrid(_X, _X, indexing="ij"))  # (2, 161, 161) m, x and y
 _TURN = (0.0, 2.0 * math.pi)  # rad
 
@@ -113,8 +114,8 @@ _TURN = (0.0, 2.0 * math.pi)  # rad
 class Section(NamedTuple):
     """A stretch of the tile along x that one family fills, in m.
 
-    The family's features lie in [begin, end]. Families that act on every sample rise from h = 0 at
-    ``low`` and are back at h = 0 at ``high``: around the zone that adds the transition bands.
+    The family's features lie in [begin, end]. Families that change every sample blend in from h = 0
+    at ``low`` and out to h = 0 at ``high``; for the whole zone these include the transition bands.
     """
 
     low: float
@@ -127,22 +128,22 @@ WHOLE_ZONE = Section(START_END, *ZONE, GOAL_BEGIN)
 
 
 def halves(meet: float) -> tuple[Section, Section]:
-    """The zone in two, both level with the platforms where they ``meet``, at that x in m."""
+    """Split the zone at x = ``meet`` m, where both parts are level with the platforms."""
     begin, end = ZONE
     return Section(START_END, begin, meet, meet), Section(meet, meet, end, GOAL_BEGIN)
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What a tile is made of, in its frame and from the start to the goal.
+    """Features of a tile, in the tile's frame; trenches and risers in order from start to goal.
 
     Attributes:
         trenches: (k, 2) m, x of both lips of each trench, where its walls meet the ground.
-        risers: (k, 2) m, x of the middle of each riser, and how far the ground rises there (down is
-            negative).
+        risers: (k, 2) m, x of the middle of each riser, and how far the ground rises there
+            (negative going down).
         pillars: (k, 3) m, x and y of the axis of each cylinder, and its diameter. In Clutter they
-            stand for whatever has to be walked around.
-        slope: rad, lateral: positive where the ground rises to the left.
+            represent all obstacles that must be walked around.
+        slope: rad, lateral; positive where the ground rises to the left.
     """
 
     trenches: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
@@ -151,7 +152,7 @@ class Features:
     slope: float = 0.0
 
     def __add__(self, other: "Features") -> "Features":
-        """Those of two stretches of one tile; slopes do not add up, a tile has one at most."""
+        """Combine two stretches of one tile; at most one of them has a slope."""
         return Features(
             np.vstack([self.trenches, other.trenches]),
             np.vstack([self.risers, other.risers]),
@@ -167,14 +168,14 @@ class Tile:
     Attributes:
         heights: (161, 161) m, the collision surface h(x, y).
         support: (161, 161) m, the surface that the fall rule measures from: ``heights`` with
-            trenches filled and pillars taken away.
+            trenches filled and pillars removed.
         start: (3,), x, y in m and yaw in rad.
         goal: (2,) m, x and y.
         family: one of ``ALL_FAMILIES``, or the path of a height map.
         difficulty: d.
-        parts: the families met along x: ``(family,)``, or the two halves of Mixed.
+        parts: the families along x: ``(family,)``, or the two parts of Mixed or Ditches.
         features: its trenches, risers, pillars and slope.
-        cell: m, the grid's resolution.
+        cell: m, grid resolution.
     """
 
     heights: HeightArray
@@ -205,7 +206,7 @@ class Tile:
 def difficulty_parameter(family: str, difficulty: float) -> float:
     """Geometric parameter p(d) = p_min + d (p_max - p_min) of a family (Eq. 1).
 
-    Mixed and Ditches have none of their own: each of their parts uses its family's.
+    Mixed and Ditches have no parameter: each of their parts uses that of its family.
 
     Raises:
         ValueError: a family without a parameter, or a difficulty outside [0, 1.2].
@@ -221,7 +222,7 @@ def difficulty_parameter(family: str, difficulty: float) -> float:
 def draw_start_goal(
     rng: np.random.Generator, shape: tuple[int, ...] = ()
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw starts (*shape, 3) as x, y, yaw and goals (*shape, 2) as x, y in a tile's frame."""
+    """Draw starts (*shape, 3), x, y and yaw, and goals (*shape, 2), x and y, in a tile's frame."""
     start, goal = np.empty((*shape, 3)), np.empty((*shape, 2))
     start[..., 0], goal[..., 0] = START_X, GOAL_X
     start[..., 1] = TILE_SIZE / 2 + rng.uniform(-Y_SPREAD, Y_SPREAD, shape)
@@ -237,11 +238,10 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
         family: one of ``ALL_FAMILIES``, or the path of a height map, whose heights are multiplied
             by d.
         difficulty: d in [0, 1.2], level / 10; the curriculum ends at 1.
-        rng: the only source of chance: the same state gives the same tile.
+        rng: the only source of randomness: the same state gives the same tile.
 
     Raises:
-        ValueError: an unknown family, a height map that cannot be used, or a difficulty outside
-            [0, 1.2].
+        ValueError: an unknown family, an unusable height map, or a difficulty outside [0, 1.2].
     """
     check_family(family)
     _check_difficulty(difficulty)
@@ -280,12 +280,13 @@ def make_tile(family: str, difficulty: float, rng: np.random.Generator) -> Tile:
 
 
 class Relief(NamedTuple):
-    """What a family adds to the flat tile within its section; sections add up to a tile.
+    """What a family adds to the flat tile within its section; a tile is the sum of its sections.
 
     Attributes:
         heights: m, broadcastable to (161, 161) and zero outside the section.
-        features: what they consist of.
-        support: m, likewise, the ground that the fall rule measures from; ``heights`` if None.
+        features: the features in ``heights``.
+        support: m, of the same shape, the surface that the fall rule measures from; ``heights`` if
+            None.
     """
 
     heights: FloatArray
@@ -293,14 +294,14 @@ class Relief(NamedTuple):
     support: FloatArray | None = None
 
 
-_NO_GROUND = np.zeros((1, 1))  # what stands on the flat base or is cut into it is no ground
+_NO_GROUND = np.zeros((1, 1))  # support of families that only stand on or cut into the flat base
 
 
 # One function per family: (section, p(d), rng) -> Relief.
 
 
 def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relief:
-    """h = A n(x, y): bilinear uniform noise, zero-mean, max |n| = 1 where fully blended in."""
+    """h = A n(x, y): bilinear uniform noise, zero-mean with max |n| = 1 where fully blended in."""
     lattice = LATTICES[rng.integers(len(LATTICES))]
     nodes = math.ceil(TILE_SIZE / lattice) + 1
     # Hat functions of the lattice at every sample: hat @ nodes @ hat.T interpolates bilinearly.
@@ -310,14 +311,14 @@ def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relie
     core = blend == 1.0
     noise -= noise[core].mean()
     noise /= np.abs(noise[core]).max()
-    # Higher peaks are possible where the noise is still blended in.
+    # The noise may exceed 1 in the bands, where it is not fully blended in.
     return Relief(amplitude * blend[:, None] * np.clip(noise, -1.0, 1.0))
 
 
 def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
     """Cylinders on a flat base; a section gets its share of the whole zone's ``count``.
 
-    A sample within a cylinder's radius is raised, so a wall leans outwards over one cell.
+    Samples within a cylinder's radius are raised, so its wall slopes outwards over one cell.
     """
     pillars = place(section, round(count * _share(section)), PILLAR_DIAMETER, rng)
     relief = np.where(_within(pillars), PILLAR_HEIGHT, 0.0)
@@ -325,7 +326,7 @@ def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
 
 
 def _within(circles: FloatArray) -> NDArray[np.bool_]:
-    """Samples (161, 161) within any of the circles (k, 3) m: x, y and diameter."""
+    """Mask (161, 161) of the samples within any of the circles (k, 3) m: x, y and diameter."""
     covered = np.zeros((TILE_SAMPLES, TILE_SAMPLES), dtype=bool)
     for cx, cy, d in circles:
         covered |= (_X[:, None] - cx) ** 2 + (_X - cy) ** 2 <= (d / 2) ** 2
@@ -333,16 +334,17 @@ def _within(circles: FloatArray) -> NDArray[np.bool_]:
 
 
 def stair(section: Section, step_height: float, rng: np.random.Generator) -> Relief:
-    """As many steps up and as many down again as the section holds, a landing between.
+    """As many steps up, and down again, as fit into the section, with a landing in between.
 
-    A riser climbs over a single cell, the steepest a grid can be, and the tread behind it is drawn
-    from ``TREAD_CELLS``, its riser's cell included. What room is left is shared at random between
-    the ground before the first riser, the landing and the ground behind the last.
+    A riser climbs over a single cell, the steepest that a grid allows. The length of the tread
+    behind it is drawn from ``TREAD_CELLS`` and includes the riser's cell. The remaining room is
+    split at random between the ground before the first riser, the landing and the ground behind the
+    last riser.
     """
     cells = _sample(section.end) - _sample(section.begin)
     low, high = TREAD_CELLS
-    up, down = rng.integers(low, high + 1, (2, cells // low))  # more than can fit
-    # n risers have n - 1 treads between them, and the last one a cell of its own.
+    up, down = rng.integers(low, high + 1, (2, cells // low))  # more than fit
+    # Each flight of n risers has n - 1 treads between them and one more cell for the last riser.
     length = 2 + np.cumsum(np.concatenate([[0], up + down])) + LANDING_CELLS
     steps = int(np.searchsorted(length, cells, side="right"))
     spare = cells - length[steps - 1]
@@ -354,23 +356,23 @@ def stair(section: Section, step_height: float, rng: np.random.Generator) -> Rel
     rise[first + 1], rise[back + 1] = step_height, -step_height
     middle = (np.concatenate([first, back[::-1]]) + 0.5) * CELL
     risers = np.column_stack([middle, np.repeat([step_height, -step_height], steps)])
-    # Counted in steps, so that the ground behind the stair is level to the last digit.
+    # Counting in steps makes the ground behind the stair exactly level.
     heights = step_height * np.cumsum(np.sign(rise))[:, None]
     return Relief(heights, Features(risers=risers))
 
 
 def gap(section: Section, width: float, rng: np.random.Generator) -> Relief:
-    """Trenches across the whole tile, at random but ``TRENCH_SPACING`` apart.
+    """Trenches across the whole tile, at random with centres at least ``TRENCH_SPACING`` apart.
 
-    Each lowers floor or ceil of w / cell samples, at random so that the mean width is w. As the
-    walls lean over one cell on either side, a trench of n samples measures n - 1, n and n + 1 cells
-    at its bottom, at half its depth and at its top.
+    Each lowers the floor or the ceiling of w / cell samples, at random so that the mean width is w.
+    Since the walls slope over one cell on either side, a trench of n samples is n - 1, n and n + 1
+    cells wide at its bottom, at half its depth and at its top.
     """
     share = _share(section)
     count = round(share * rng.integers(TRENCHES[0], TRENCHES[1] + 1))
     cells = round(width / CELL, 6)
     lowered = math.floor(cells) + (rng.uniform(size=count) < cells % 1.0)
-    # Snapping to the grid moves centres by less than a cell to the right, so one is kept in hand.
+    # Snapping to the grid moves centres by less than a cell towards +x, so one cell is reserved.
     spacing = TRENCH_SPACING + CELL
     room = section.end - section.begin - 2.0 * TRENCH_MARGIN - CELL - (count - 1) * spacing
     free = np.sort(rng.uniform(0.0, room, count))
@@ -384,7 +386,7 @@ def gap(section: Section, width: float, rng: np.random.Generator) -> Relief:
 
 
 def tilt(section: Section, angle: float, rng: np.random.Generator) -> Relief:
-    """h = +-(y - W/2) tan(theta), either side as likely, blended in and out."""
+    """h = +-(y - W/2) tan(theta), either sign with equal probability, blended in and out."""
     slope = float(rng.choice([-1.0, 1.0])) * angle
     relief = _blend(section, TILT_BAND)[:, None] * (_X - TILE_SIZE / 2) * math.tan(slope)
     return Relief(relief, Features(slope=slope))
@@ -393,9 +395,9 @@ def tilt(section: Section, angle: float, rng: np.random.Generator) -> Relief:
 def clutter(section: Section, step: float, rng: np.random.Generator) -> Relief:
     """Flat ground, hills or paving, with slabs to step on and posts, pits or walls to walk around.
 
-    No step is higher than ``step``, but for those of hills, whose slope adds to it. The kinds of
-    ground and of obstacles are drawn for each tile, so no two are much alike. A section gets its
-    share of what a whole zone has of slabs and obstacles.
+    No step is higher than ``step``, except on hills, whose slope adds to it. The kinds of ground
+    and of obstacles are drawn for each tile, so that tiles differ widely. A section gets its share
+    of the slabs and obstacles of a whole zone.
     """
     kind = rng.choice(["flat", "hills", "paving"])
     if kind == "paving":
@@ -404,7 +406,7 @@ def clutter(section: Section, step: float, rng: np.random.Generator) -> Relief:
         ground = _hills(WAVE_SLOPE * step, rng) if kind == "hills" else np.zeros_like(_PLANE[0])
     ground *= _blend(section, BAND)[:, None]
     inside = (section.begin <= _X) & (section.end >= _X)
-    if kind != "paving":  # on which slabs would add steps to its own
+    if kind != "paving":  # slabs would add to the steps between its stones
         ground = np.where(inside[:, None], _with_slabs(ground, section, step, rng), ground)
     obstacles = str(rng.choice(["none", "posts", "pits", "walls"]))
     circles = np.empty((0, 3))
@@ -420,7 +422,7 @@ def clutter(section: Section, step: float, rng: np.random.Generator) -> Relief:
 
 
 def _hills(slope: float, rng: np.random.Generator) -> FloatArray:
-    """Plane waves in all directions, nowhere steeper than ``slope``, (161, 161) m."""
+    """Sum of plane waves in random directions, nowhere steeper than ``slope``, (161, 161) m."""
     heights = np.zeros_like(_PLANE[0])
     low, high = np.array([WAVE_LENGTH, _TURN, _TURN]).T
     for length, turn, phase in rng.uniform(low, high, (WAVES, 3)):
@@ -431,18 +433,18 @@ def _hills(slope: float, rng: np.random.Generator) -> FloatArray:
 
 
 def _paving(step: float, rng: np.random.Generator) -> FloatArray:
-    """Stones of one size, turned, each at a height of its own, (161, 161) m."""
+    """Rotated grid of equal stones, each at its own random height, (161, 161) m."""
     turn, side = rng.uniform(*_TURN), rng.uniform(*PAVING, 2)
-    stones = step * rng.uniform(-0.5, 0.5, (128, 128))  # more than lie on a tile
+    stones = step * rng.uniform(-0.5, 0.5, (128, 128))  # more than fit on a tile
     u, v = _turned(_PLANE - TILE_SIZE / 2, turn)
     row, col = np.floor(u / side[0]).astype(int), np.floor(v / side[1]).astype(int)
-    return np.asarray(stones[row, col])  # from the other end where negative
+    return np.asarray(stones[row, col])  # negative indices wrap around
 
 
 def _with_slabs(
     ground: FloatArray, section: Section, step: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Ground with slabs and bars on it, each up to ``step`` thick; none lies on another."""
+    """Ground with slabs and bars on it, each up to ``step`` thick; they do not stack."""
     heights = ground.copy()
     for _ in range(round(_share(section) * rng.integers(SLABS + 1))):
         centre = rng.uniform([section.begin, 0.0], [section.end, TILE_SIZE])
@@ -455,14 +457,14 @@ def _with_slabs(
 
 
 def _turned(points: FloatArray, turn: float) -> tuple[FloatArray, FloatArray]:
-    """Coordinates of ``points`` (2, ...) along axes that are turned by ``turn`` rad."""
+    """Coordinates of ``points`` (2, ...) along axes rotated by ``turn`` rad."""
     x, y = points
     cosine, sine = math.cos(turn), math.sin(turn)
     return x * cosine + y * sine, y * cosine - x * sine
 
 
 def _walls(placed: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Walls turned at random as rows of cylinders, (k, 3) m, from their middles and lengths
+    """Walls in random directions as rows of cylinders, (k, 3) m, from their centres and lengths
     ``placed`` (n, 3) m."""
     rows = [np.empty((0, 3))]
     for cx, cy, length in placed:
@@ -475,21 +477,23 @@ def _walls(placed: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _share(section: Section) -> float:
-    """The section's length over that of a whole zone."""
+    """The section's length as a share of the whole zone's."""
     return (section.end - section.begin) / (ZONE[1] - ZONE[0])
 
 
 def is_map(family: str) -> bool:
-    """Whether a family is a file with heights of the user's own."""
+    """Whether a family is the path of a user's height map."""
     return family.endswith(MAP_ENDING)
 
 
 @functools.lru_cache
 def height_map(path: str) -> FloatArray:
-    """Heights (161, 161) in m of a file, those of the zone at difficulty 1; the platforms are flat.
+    """Heights (161, 161) in m from a file, as used at difficulty 1.
+
+    Only the zone and its transition bands use them; the platforms are flat.
 
     Raises:
-        ValueError: no such file, or one that holds something else.
+        ValueError: the file is missing or does not hold such heights.
     """
     try:
         heights = np.load(path, allow_pickle=False)
@@ -506,29 +510,29 @@ def height_map(path: str) -> FloatArray:
 
 
 def family_number(family: str) -> int:
-    """A number of each family's own, below 2**32: part of the seeds of its tiles."""
+    """Number of a family, below 2**32, as part of its tiles' seeds; maps go by their heights."""
     if is_map(family):
         return zlib.crc32(height_map(family).tobytes()) | 2**31  # above those of ALL_FAMILIES
     return ALL_FAMILIES.index(family)
 
 
 def file_label(family: str) -> str:
-    """A family's name as a part of a file's name."""
+    """A family's name in a form that is safe in file names."""
     return re.sub(r"[^\w.-]", "-", family)
 
 
 def place(
     section: Section, count: int, diameters: tuple[float, float], rng: np.random.Generator
 ) -> FloatArray:
-    """Centres and diameters (count, 3) in m of cylinders that keep their clearance.
+    """Draw centres and diameters (count, 3) in m of cylinders that keep their clearance.
 
-    One after the other at random among free places. If one finds none, all start over: even
-    the 28 of level 12 take up no more than 40 % of the room, where random placing jams near 55 %.
+    Cylinders are placed one by one at random free positions. If there is none, all start over: even
+    the 28 of level 12 take up at most 40 % of the room, and random placement jams near 55 %.
 
     Raises:
         RuntimeError: no room for so many.
     """
-    restarts, candidates = 100, 256  # ample: at level 12 one tile in 25 restarts, easier ones fewer
+    restarts, candidates = 100, 256  # ample: one tile in 25 restarts at level 12, fewer below
     for _ in range(restarts):
         placed = np.empty((0, 3))
         for d in rng.uniform(*diameters, count):
@@ -560,34 +564,35 @@ _SURFACES: dict[str, Callable[[Section, float, np.random.Generator], Relief]] = 
 def tile_rng(
     seed: int, family: str, level: int, index: int, stream: int = TRAIN_STREAM
 ) -> np.random.Generator:
-    """Generator of tile number ``index`` of a family and level; streams and tiles never share one.
+    """Generator for tile number ``index`` of a family and level, unique to this tile and stream.
 
     Raises:
         ValueError: an unknown family, or a number outside [0, 2**32).
     """
     check_family(family)
     entropy = (stream, int(seed), family_number(family), int(level), int(index))
-    # Numbers of more than 32 bits would take two words and could then run into their neighbours.
+    # A number of more than 32 bits would take two words, so that different entropies could collide.
     if not all(0 <= number < 2**32 for number in entropy):
         raise ValueError(f"stream, seed, level and index must lie in [0, 2**32), got {entropy}")
     return np.random.default_rng(np.random.SeedSequence(entropy))
 
 
 class TileField:
-    """Tiles side by side in one height field, (rows, cols) of them, rows along x.
+    """A (rows, cols) grid of tiles in one height field, with rows along x.
 
-    Tiles share no samples, so they repeat every 8.05 m. The world frame has sample [0, 0] at
-    (0, 0); a tile's frame is the world's less ``origin``.
+    Tiles share no samples, so they repeat every 8.05 m along x, and along y if not cropped. The
+    world frame has sample [0, 0] at (0, 0); a tile's frame is the world frame shifted by
+    ``origin``.
 
     Attributes:
         shape: (rows, cols).
-        crop: m, left out of each tile at both of its sides in y: a narrower field for training,
-            where Bullet's 600 bytes a sample are what fills memory.
-        heights, support: (161 rows, n cols) m, see ``Tile``; n is 161 less the crop. ``place``
-            overwrites them in place.
-        starts, goals: (rows, cols, 3) and (rows, cols, 2), each tile's own start (x, y, yaw) and
-            goal (x, y), in the tile's frame.
-        features: (row, col) -> those of the tile there, in its frame; none until one is placed.
+        crop: m, cut off each tile on both sides in y. Training uses a narrower field because
+            Bullet's 600 bytes per sample dominate memory use.
+        heights, support: (161 rows, n cols) m, see ``Tile``; n is 161 less the cropped samples.
+            ``place`` overwrites them in place.
+        starts, goals: (rows, cols, 3) and (rows, cols, 2), start (x, y, yaw) and goal (x, y) of
+            each tile, in its frame.
+        features: (row, col) -> ``Features`` of that tile, in its frame; empty until one is placed.
 
     Raises:
         ValueError: a crop that leaves no room for starts and goals.
@@ -608,7 +613,7 @@ class TileField:
         self.features = {tile: Features() for tile in np.ndindex(rows, cols)}
 
     def place(self, row: int, col: int, tile: Tile) -> None:
-        """Copy one tile into the field, in place."""
+        """Copy a tile into the field, in place."""
         n, m, cut = TILE_SAMPLES, self._width, self._cut
         where = np.s_[row * n : (row + 1) * n, col * m : (col + 1) * m]
         self.heights[where] = tile.heights[:, cut : cut + m]
@@ -617,7 +622,7 @@ class TileField:
         self.features[row, col] = tile.features
 
     def origin(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
-        """World xy (..., 2) in m of the origin of the frames of the tiles at (row, col)."""
+        """World xy (..., 2) in m of the origins of the frames of the tiles at (row, col)."""
         index = np.stack(np.broadcast_arrays(row, col), axis=-1)
         pitch = np.array([TILE_SAMPLES, self._width]) * self.cell
         return np.asarray(index * pitch - np.array([0.0, self.crop]))
@@ -625,7 +630,7 @@ class TileField:
     def on_tile(
         self, row: ArrayLike, col: ArrayLike, x: ArrayLike, y: ArrayLike
     ) -> NDArray[np.bool_]:
-        """Whether world points lie on the tiles at (row, col), less the crop; all broadcast."""
+        """Whether world points lie on the tiles at (row, col), without the crop; all broadcast."""
         local = np.stack(np.broadcast_arrays(x, y), axis=-1) - self.origin(row, col)
         low = np.array([0.0, self.crop])
         return np.asarray(((local >= low) & (local <= TILE_SIZE - low)).all(axis=-1))
@@ -640,18 +645,18 @@ class TileField:
 
 
 def interpolate(surface: HeightArray, cell: float, x: ArrayLike, y: ArrayLike) -> FloatArray:
-    """Height in m at points (x, y) of any shape, exactly as Bullet's triangles have it.
+    """Height in m at points (x, y) of any shape, exactly as on Bullet's triangles.
 
     Bullet splits each cell along the diagonal from [ix + 1, iy] to [ix, iy + 1] (its default,
-    measured with rays and with contacts). Both ends of the diagonal weigh in everywhere; the third
-    corner is [ix, iy] on one side of it and [ix + 1, iy + 1] on the other. Points outside take the
-    nearest border's height, and the height at a NaN is one.
+    measured with rays and with contacts). Both ends of the diagonal contribute everywhere; the
+    third corner is [ix, iy] on one side of it and [ix + 1, iy + 1] on the other. Points outside get
+    the height of the nearest border; the height at NaN is NaN.
     """
     nx, ny = surface.shape
     flat = surface.reshape(-1)
     u = np.clip(np.asarray(x) / cell, 0.0, nx - 1)
     v = np.clip(np.asarray(y) / cell, 0.0, ny - 1)
-    ix = np.minimum(np.nan_to_num(u).astype(np.intp), nx - 2)  # a robot that blew up has no place
+    ix = np.minimum(np.nan_to_num(u).astype(np.intp), nx - 2)  # NaN where the simulation diverged
     iy = np.minimum(np.nan_to_num(v).astype(np.intp), ny - 2)
     u, v = u - ix, v - iy
     corner = ix * ny + iy
@@ -671,15 +676,15 @@ def _blend(section: Section, band: float) -> FloatArray:
 
 
 def _sample(x: float) -> int:
-    """Index of the sample at x."""
+    """Index of the sample at ``x`` m."""
     return round(x / CELL)
 
 
 def check_family(family: str, beside: Sequence[str] = ()) -> None:
-    """See that a tile of the family can be made; those ``beside`` are allowed, too.
+    """Check that tiles of a family can be made; the names in ``beside`` are allowed as well.
 
     Raises:
-        ValueError: an unknown name, or a height map that cannot be used.
+        ValueError: an unknown name, or an unusable height map.
     """
     if is_map(family):
         height_map(family)

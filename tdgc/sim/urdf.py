@@ -1,9 +1,9 @@
-"""A robot's URDF: its joints, its links, and what is fixed to which of them.
+"""A robot's URDF: its joints, its links, and the links that are fixed to them.
 
-Bullet simulates what is fixed to a link as a body of its own: PyBullet's A1, with nine such bodies
-beside its thirteen, takes a third longer a step than with them merged. Its own
-URDF_MERGE_FIXED_LINKS takes the carrying link's centre of mass for its origin, so ``merged`` is
-written here.
+Bullet simulates a link on a fixed joint as a separate body: PyBullet's A1 has nine such bodies
+besides its thirteen links, and a step takes a third longer than with them merged. PyBullet's
+URDF_MERGE_FIXED_LINKS mistakes the centre of mass of the carrying link for its origin, so
+``merged`` does this instead.
 """
 
 import contextlib
@@ -32,12 +32,12 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A link, and where it is in the frame of the link that carries it.
+    """A link and its pose in the frame of the moving link that carries it.
 
     Attributes:
-        link: its element.
-        place: of its origin, (3,) m.
-        rotation: from its frame, (3, 3).
+        link: element of the link.
+        place: position of its origin in the carrying link's frame, (3,) m.
+        rotation: from its own frame to the carrying link's, (3, 3).
     """
 
     link: Element
@@ -45,25 +45,25 @@ class Part:
     rotation: Array
 
     def carry(self, joint: Element, link: Element) -> "Part":
-        """The part that ``joint`` fixes to this one."""
+        """The part of ``link``, which ``joint`` fixes to this one."""
         return Part(link, *self.at(joint))
 
     def at(self, element: Element) -> tuple[Array, Array]:
-        """Place and rotation of an element's ``origin`` in the carrying link's frame."""
+        """Position and rotation of an element's ``origin`` in the carrying link's frame."""
         place, turn = (numbers(element, "origin", key, "0 0 0") for key in ("xyz", "rpy"))
         return self.place + self.rotation @ place, self.rotation @ _rotation(turn)
 
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """What a URDF says.
+    """Contents of a URDF.
 
     Attributes:
-        path: of the file.
-        root: its element.
-        joints: the twelve of ``JOINTS``, by name.
-        parts: by name the trunk and in each leg hip, thigh and calf: itself first, then what is
-            fixed to it. There are no other links.
+        path: path of the file.
+        root: root element.
+        joints: the twelve joints of ``JOINTS``, by name.
+        parts: link name -> parts, for the trunk and the hip, thigh and calf of each leg: the link
+            itself first, then all that is fixed to it. There are no other links.
     """
 
     path: Path
@@ -86,11 +86,11 @@ def urdf_path(config: RobotConfig) -> Path:
 
 
 def read_urdf(config: RobotConfig) -> Urdf:
-    """The URDF that ``config`` names.
+    """Read the URDF that ``config`` names.
 
     Raises:
-        ConfigError: a file that is not there, cannot be read or has other joints or links; the
-            message says what is wrong with it and what is allowed.
+        ConfigError: the file is missing, cannot be read or has other joints or links; the message
+            says what is wrong and what is allowed.
     """
     path = urdf_path(config)
     with named(path):
@@ -106,7 +106,7 @@ def read_urdf(config: RobotConfig) -> Urdf:
 
 @contextlib.contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Errors in here are of the file at ``path``."""
+    """Prefix a ``ConfigError`` raised in the block with ``path``."""
     try:
         yield
     except ConfigError as error:
@@ -118,10 +118,10 @@ def named(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def merged_file(config: RobotConfig) -> Iterator[Path]:
-    """A URDF of the same robot without fixed joints: its own file, if that has none.
+    """URDF of the same robot with fixed links merged: a temporary file, or its own if it has none.
 
     Raises:
-        ConfigError: as ``read_urdf``, or a link without an inertia.
+        ConfigError: see ``read_urdf``; also a link without an inertia.
     """
     urdf = read_urdf(config)
     if all(len(parts) == 1 for parts in urdf.parts.values()):
@@ -130,17 +130,17 @@ def merged_file(config: RobotConfig) -> Iterator[Path]:
     with named(urdf.path):
         text = ElementTree.tostring(merged(urdf), encoding="unicode")
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / urdf.path.name  # Bullet's own messages name it
+        path = Path(folder) / urdf.path.name  # same name, for Bullet's messages
         path.write_text(text, encoding="utf-8")
         yield path
 
 
 def merged(urdf: Urdf) -> Element:
-    """The robot with the mass, the inertia and the shapes of what is fixed to a link in that link,
-    and meshes by their absolute paths.
+    """The robot with the mass, inertia and shapes of fixed links moved to the links that carry
+    them, and meshes named by absolute paths.
 
     Raises:
-        ConfigError: a link without an inertia; names it.
+        ConfigError: a link without an inertia; the message names it.
     """
     robot = copy.deepcopy(urdf.root)
     links = {link.get("name", ""): link for link in robot.findall("link")}
@@ -163,31 +163,31 @@ def merged(urdf: Urdf) -> Element:
 
 
 def _inertia(part: Part) -> tuple[float, Array, Array]:
-    """Mass in kg, centre of mass (3,) m and inertia about it (3, 3) kg m^2 in the carrier's
-    frame."""
+    """Mass in kg, centre of mass (3,) m and inertia about it (3, 3) kg m^2, in the frame of the
+    carrying link."""
     link = part.link
     xx, xy, xz, yy, yz, zz = (
         float(numbers(link, "inertial/inertia", key, "", 1)[0]) for key in _INERTIA
     )
     inertial = link.find("inertial")
-    assert inertial is not None  # it has a mass
+    assert inertial is not None  # as its mass was checked
     centre, turn = part.at(inertial)
     return mass(link), centre, turn @ [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]] @ turn.T
 
 
 def _together(bodies: list[tuple[float, Array, Array]]) -> tuple[float, Array, Array]:
-    """Mass, centre of mass and inertia about it of bodies that move as one."""
+    """Mass, centre of mass and inertia about it of rigidly connected bodies."""
     total = sum(body[0] for body in bodies)
     centre = np.asarray(sum(body[0] * body[1] for body in bodies) / total)
     inertia = np.zeros((3, 3))
     for weight, place, own in bodies:
         arm = place - centre
-        inertia += own + weight * (arm @ arm * np.eye(3) - np.outer(arm, arm))  # Steiner
+        inertia += own + weight * (arm @ arm * np.eye(3) - np.outer(arm, arm))  # parallel axes
     return total, centre, inertia
 
 
 def _weigh(link: Element, total: float, centre: Array, inertia: Array) -> None:
-    """Give a link this mass, centre of mass and inertia."""
+    """Set the mass, centre of mass and inertia of a link."""
     inertial = link.find("inertial")
     assert inertial is not None
     inertial.clear()
@@ -198,7 +198,7 @@ def _weigh(link: Element, total: float, centre: Array, inertia: Array) -> None:
 
 
 def _move(shape: Element, place: Array, rotation: Array) -> None:
-    """Put a shape at ``place`` (3,), turned by ``rotation`` (3, 3)."""
+    """Set the origin of a shape to ``place`` (3,) m and ``rotation`` (3, 3)."""
     origin = shape.find("origin")
     if origin is None:
         origin = ElementTree.SubElement(shape, "origin")
@@ -207,13 +207,15 @@ def _move(shape: Element, place: Array, rotation: Array) -> None:
 
 
 def _found(name: str, urdf: Path) -> str:
-    """Absolute path of a mesh that a URDF names relative to itself or to its package; ``name`` as
-    it is where there is no such file, which Bullet then says."""
+    """Absolute path of a mesh that a URDF names relative to itself or to its package.
+
+    If there is no such file, ``name`` stays as it is, and Bullet reports it.
+    """
     inside = name.removeprefix("package://")
     for folder in urdf.parents:
         if (folder / inside).is_file():
             return str(folder / inside)
-        if inside == name:  # relative to the file alone
+        if inside == name:  # relative to the URDF's own folder only
             break
     return name
 
@@ -222,7 +224,7 @@ def _found(name: str, urdf: Path) -> str:
 
 
 def _parse(text: str) -> Element:
-    # Without a document type there are no entities of its own, which could expand without end.
+    # Without a document type a file cannot define entities, which could expand without end.
     if "<!DOCTYPE" in text:
         raise ConfigError("a URDF has no document type (<!DOCTYPE>)")
     try:
@@ -232,7 +234,7 @@ def _parse(text: str) -> Element:
 
 
 def _joints(robot: Element) -> tuple[dict[str, Element], list[Element]]:
-    """The joints of ``JOINTS`` by name, and the fixed ones; there are no others."""
+    """The joints of ``JOINTS`` by name, and the fixed joints; any others are an error."""
     found = robot.findall("joint")
     names = Counter(joint.get("name", "") for joint in found)
     missing = [name for name in JOINTS if name not in names]
@@ -252,8 +254,7 @@ def _joints(robot: Element) -> tuple[dict[str, Element], list[Element]]:
 def _parts(
     robot: Element, joints: dict[str, Element], fixed: list[Element]
 ) -> dict[str, list[Part]]:
-    """By name the trunk and in each leg hip, thigh and calf: itself first, then what is fixed to
-    it. There are no other links."""
+    """Parts by link name, see ``Urdf.parts``; links that belong to none are an error."""
     links = {link.get("name", ""): link for link in robot.findall("link")}
     if len(links) < len(robot.findall("link")):
         raise ConfigError("two of its links have one name")
@@ -275,7 +276,7 @@ def _parts(
         if carrier not in links:
             raise ConfigError(f"a joint moves the link {reprlib.repr(carrier)}, which is not there")
         mine = placed[carrier] = [Part(links.pop(carrier), np.zeros(3), np.eye(3))]
-        for above in mine:  # which grows
+        for above in mine:  # grows here, so that chains are followed
             for joint in fixed:
                 if link_of(joint, "parent") == above.link.get("name"):
                     child = links.pop(link_of(joint, "child"), None)
@@ -293,7 +294,7 @@ def _parts(
 
 
 def mass(link: Element) -> float:
-    """kg; Bullet would hold a trunk without a mass in the air."""
+    """Mass in kg; must be positive, since Bullet would fix a trunk without mass in the air."""
     value = float(numbers(link, "inertial/mass", "value", "", 1)[0])
     if not value > 0.0:
         raise ConfigError(f"{called(link)}: its mass must be positive, not {value}")
@@ -301,13 +302,13 @@ def mass(link: Element) -> float:
 
 
 def link_of(joint: Element, which: str) -> str:
-    """Name of a joint's ``parent`` or ``child``."""
+    """Name of the link that is a joint's ``parent`` or ``child``."""
     found = joint.find(which)
     return "" if found is None else found.get("link", "")
 
 
 def numbers(element: Element, path: str, key: str, default: str, count: int = 3) -> Array:
-    """An attribute's numbers, (count,); ``default`` where there is none."""
+    """Numbers in attribute ``key`` of the child at ``path``, (count,); ``default`` if absent."""
     found = element.find(path)
     text = default if found is None else found.get(key, default)
     try:
@@ -323,7 +324,8 @@ def numbers(element: Element, path: str, key: str, default: str, count: int = 3)
 
 
 def _rotation(rpy: Array) -> Array:
-    """Of a URDF's roll, pitch and yaw, (3,) rad, about fixed axes in that order: (3, 3)."""
+    """Rotation matrix (3, 3) of a URDF's roll, pitch and yaw, (3,) rad about fixed axes in this
+    order."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
     return np.array(
         [
@@ -335,10 +337,10 @@ def _rotation(rpy: Array) -> Array:
 
 
 def _roll_pitch_yaw(rotation: Array) -> Array:
-    """The inverse of ``_rotation``: (3,) rad of ``rotation`` (3, 3)."""
+    """Roll, pitch and yaw, (3,) rad, of ``rotation`` (3, 3), the inverse of ``_rotation``."""
     cos, sin, cos_pitch = rotation[0, 0], rotation[1, 0], np.hypot(*rotation[:2, 0])
     pitch = np.arctan2(-rotation[2, 0], cos_pitch)
-    if cos_pitch < 1e-9:  # straight up or down, where roll and yaw are one turn
+    if cos_pitch < 1e-9:  # straight up or down: only roll and yaw combined matter
         return np.array([0.0, pitch, np.arctan2(-rotation[0, 1], rotation[1, 1])])
     return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(sin, cos)])
 
@@ -348,5 +350,5 @@ def _text(values: ArrayLike) -> str:
 
 
 def called(element: Element) -> str:
-    """An element as messages name it."""
+    """Tag and name of an element, for messages."""
     return f"{element.tag} {reprlib.repr(element.get('name', ''))}"

@@ -1,6 +1,6 @@
 """A Bullet world of M robots: the only module that imports pybullet.
 
-Robots pass through each other (a collision mask). Arrays have a leading axis of M robots.
+A collision mask lets robots pass through each other. Arrays have a leading axis of M robots.
 """
 
 import contextlib
@@ -32,15 +32,16 @@ from tdgc.sim.robot import (
 from tdgc.sim.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
 from tdgc.sim.urdf import JOINTS, merged_file, urdf_path
 
-_GROUND, _ROBOT = 1, 2  # collision groups: robots meet the ground and nothing else
-_TRUNK = -1  # Bullet's number of a body's root link
-_PARKED = 50.0  # m above its place nothing touches a robot: terrain stays within HEIGHT_RANGE
-_SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out from it
-_FOOT_REACH = 0.03  # m below the foot's centre sits a contact that is the foot's, not the calf's
+_GROUND, _ROBOT = 1, 2  # collision groups: robots collide with the ground only
+_TRUNK = -1  # Bullet's index of a body's root link
+_PARKED = 50.0  # m, lift that clears all terrain, which stays within HEIGHT_RANGE
+_SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out
+_FOOT_REACH = 0.03  # m beyond the foot's radius: nearer calf contacts are the foot's
 
 
 def _load() -> Any:
-    """PyBullet, whose import says when it was built, in each process and over progress bars."""
+    """Import PyBullet without its build-time message, which every process would print over
+    progress bars."""
     stream = os.dup(2)
     try:
         with open(os.devnull, "wb") as nowhere:
@@ -57,17 +58,17 @@ pybullet = _load()
 class _Client:
     """pybullet's functions bound to one connection.
 
-    pybullet_utils' BulletClient binds at every call, which costs as much as a short call; here
-    each function is bound once, at its first use.
+    pybullet_utils' BulletClient binds at every call, which costs as much as a short call. Here
+    each function is bound once, on first use.
     """
 
     def __init__(self, robots: tuple[int, int], window: bool) -> None:
         self.id: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
-        self.robots = robots  # of the world: the first, and the one after the last
-        self.rows: dict[int, int] = {}  # row of the world that a body of this client is
+        self.robots = robots  # rows of the world: the first, and one past the last
+        self.rows: dict[int, int] = {}  # body of this client -> row of the world
         self.ground = -1
         self.shape = -1
-        self.samples = slice(0, 0)  # of the field along x, that this client holds
+        self.samples = slice(0, 0)  # this client's part of the field, along x
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         bound = functools.partial(getattr(pybullet, name), physicsClientId=self.id)
@@ -75,25 +76,25 @@ class _Client:
         return bound
 
 
-#: Robots a Bullet client. Bullet walks all constraints of a client for each robot's island, so the
-#: time a robot takes grows with their number: measured on a plane 44 us a step with 5 in a client,
-#: 46 with 10, 54 with 25, 75 with 50, 122 with 100.
+#: Robots per Bullet client. For each robot's island Bullet walks all constraints of the client, so
+#: the time per robot grows with their number. Measured on a plane, a step takes 44 us per robot
+#: with 5 robots in a client, 46 with 10, 54 with 25, 75 with 50 and 122 with 100.
 CLIENT_ROBOTS = 10
 
 
 class World:
-    """M robots on a plane, or each on a tile row of its own in a field.
+    """M robots on a plane, or each on its own row of tiles in a field.
 
-    Robots are spread over several Bullet clients, ``CLIENT_ROBOTS`` in each; a client holds its own
-    robots' part of the field only. ``visual`` keeps what is needed for pictures, ``window`` shows
-    all in Bullet's own window.
+    Robots are spread over Bullet clients with at most ``CLIENT_ROBOTS`` each; a client holds only
+    its own robots' part of the field. ``visual`` loads what pictures need, ``window`` opens
+    Bullet's own window.
 
     Raises:
-        ConfigError: the robot's URDF is not there or no robot that this package can drive.
+        ConfigError: the robot's URDF is missing, or not of a robot that this package can drive.
 
     Attributes:
         state: the ``RobotState`` after the last step, push or reset.
-        strength: (M, 1) motor strength, times gains and torque limits.
+        strength: (M, 1) motor strength, a factor on gains and torque limits.
         joint_friction: (M, 1) N m, dry friction in each joint.
         bullet_seconds: wall time spent inside Bullet's step so far.
     """
@@ -127,16 +128,16 @@ class World:
                 self._connect(rows, urdf, window)
         self._joint_inertia = [self._inertia_about_joint(joint) for joint in self._joints]
         trunk = self._client_of[0].getDynamicsInfo(self._bodies[0], _TRUNK)
-        # Bullet's pose of a robot is that of its trunk's inertia: where its centre of mass is in
-        # the trunk's frame, and how the axes of its inertia are turned there.
+        # Bullet's pose of a robot is that of the trunk's inertial frame: these are the centre of
+        # mass and the orientation of the principal axes in the trunk's frame.
         self._trunk_inertia, self._centre, self._axes = map(np.array, trunk[2:5])
         self._active = np.arange(num_robots)
 
     def _connect(self, rows: NDArray[np.int64], urdf: Path, window: bool) -> None:
-        """Give the robots ``rows`` (n,) a client, with their ground."""
+        """Create a client for the robots ``rows`` (n,), with their ground."""
         client = _Client((int(rows[0]), int(rows[-1]) + 1), window)
         client.setGravity(0.0, 0.0, -GRAVITY)
-        # No early stop of the solver: it would couple robots through the worst residual.
+        # The solver must not stop early: the worst residual would couple the robots.
         client.setPhysicsEngineParameter(
             fixedTimeStep=self.physics.hold * self.physics.dt,
             numSubSteps=self.physics.hold if self.physics.hold > 1 else 0,
@@ -160,8 +161,8 @@ class World:
             heights = self.field.heights[client.samples]
             low, high = float(heights.min()), float(heights.max())
             if heights.flags.writeable:
-                # The first upload fixes the height range that Bullet keeps, so it spans all that
-                # tiles can ever be; the second brings the heights.
+                # Bullet keeps the height range of the first upload, so that spans everything
+                # that tiles can ever need; the second sends the heights.
                 low, high = HEIGHT_RANGE
                 spanning = np.zeros_like(heights)
                 spanning[0, 0], spanning[0, 1] = HEIGHT_RANGE
@@ -176,16 +177,16 @@ class World:
                 0.5 * (ny - 1) * cell,
                 0.5 * (low + high),
             ]
-            # Without a visual of its own, Bullet keeps 360 bytes a sample to draw the field.
+            # Without another visual shape, Bullet keeps 360 bytes per sample to draw the field.
             drawn = -1
             if not self._visual:
                 drawn = client.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001)
             client.ground = client.createMultiBody(0.0, client.shape, drawn, basePosition=centre)
-        client.changeDynamics(client.ground, -1, lateralFriction=1.0)  # feet carry the friction
+        client.changeDynamics(client.ground, -1, lateralFriction=1.0)  # the feet set the friction
         client.setCollisionFilterGroupMask(client.ground, -1, _GROUND, _ROBOT)
 
     def _upload(self, client: _Client, heights: NDArray[np.float32], replace: int) -> int:
-        """Send heights to Bullet, which checks neither sizes nor range, so this does."""
+        """Send heights to Bullet after checking their number and range, which Bullet does not."""
         assert self.field is not None
         if heights.size > MAX_SAMPLES:
             raise ValueError(f"Bullet holds {MAX_SAMPLES} samples a field, not {heights.size}")
@@ -204,13 +205,13 @@ class World:
         )
 
     def upload_terrain(self, index: ArrayLike | None = None) -> None:
-        """Bring the field's heights, redrawn in place, into Bullet.
+        """Send the field's heights to Bullet after they were changed in place.
 
-        With ``index`` only where those robots' tiles changed. About 1 us a sample of every client
-        concerned, so it is for the ends of episodes, not for every step.
+        With ``index`` only the clients of those robots are updated. This takes about 1 us for each
+        sample of these clients: do it at the end of an episode, not in every step.
 
         Raises:
-            ValueError: heights outside the range that the field was made for.
+            ValueError: heights outside ``HEIGHT_RANGE``.
         """
         assert self.field is not None, "a plane has no heights"
         rows = range(self.num_robots) if index is None else np.asarray(index)
@@ -218,7 +219,7 @@ class World:
             self._upload(client, self.field.heights[client.samples], client.shape)
 
     def _load_robot(self, client: _Client, place: int, urdf: Path) -> int:
-        # Apart and high, so that nothing touches before the first reset.
+        # Far apart and high up, so that nothing is in contact before the first reset.
         try:
             body = client.loadURDF(
                 str(urdf),
@@ -226,7 +227,7 @@ class World:
                 flags=pybullet.URDF_USE_INERTIA_FROM_FILE
                 | (0 if self._visual else pybullet.URDF_IGNORE_VISUAL_SHAPES),
             )
-        except pybullet.error as error:  # a mesh that is not there, an element it cannot read
+        except pybullet.error as error:  # a missing mesh, an element it cannot read
             path = urdf_path(self.robot)
             raise ConfigError(f"{path}: Bullet cannot load it and says why above") from error
         links = range(client.getNumJoints(body))
@@ -234,8 +235,8 @@ class World:
         self._joints = [found[name] for name in JOINTS]
         self._leg_of_link = {link: k // 3 for k, link in enumerate(self._joints)}
         self._calf_links = set(self._joints[2::3])
-        # Bullet holds one speed limit a body, so it gets the slowest joint's: a calf that whips at
-        # the other joints' 30 rad/s moves its foot further a step than the foot's radius.
+        # Bullet has one speed limit per body, so it gets the slowest joint's: a calf at the other
+        # joints' 30 rad/s would move its foot by more than the foot's radius in a step.
         slowest = min(self.robot.speed_limit)
         for link in (_TRUNK, *links):
             client.setCollisionFilterGroupMask(body, link, _ROBOT, _GROUND)
@@ -247,9 +248,9 @@ class World:
                 jointDamping=0.0,
                 maxJointVelocity=slowest,
             )
-            # In the call above, with dampings, PyBullet would give it to the trunk instead.
+            # Not in the call above: together with damping, PyBullet would set it on the trunk.
             client.changeDynamics(body, link, lateralFriction=self.physics.friction)
-        # Bullet's default velocity motors would hold the joints.
+        # Switch off Bullet's default velocity motors, which would hold the joints.
         client.setJointMotorControlArray(
             body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * NUM_JOINTS
         )
@@ -262,8 +263,8 @@ class World:
         quaternion: Array,
         q: Array,
     ) -> None:
-        """Put the robots ``index`` (n,) at rest at ``position`` (n, 3), ``quaternion`` (n, 4)
-        with joint angles ``q`` (n, 12); refreshes ``state``."""
+        """Place the robots ``index`` (n,) at rest at ``position`` (n, 3), ``quaternion`` (n, 4)
+        with joint angles ``q`` (n, 12), and refresh ``state``."""
         state = self.state
         for k, i in enumerate(index):
             state.position[i], state.quaternion[i], state.q[i] = position[k], quaternion[k], q[k]
@@ -275,7 +276,7 @@ class World:
         state.derive()
 
     def _put(self, i: int) -> None:
-        """Bring robot ``i`` of Bullet to where ``state`` has it."""
+        """Set Bullet's robot ``i`` to its pose and velocities in ``state``."""
         body, client, state = self._bodies[i], self._client_of[i], self.state
         self._place_trunk(i, state.position[i])
         self._move_trunk(i)
@@ -283,11 +284,11 @@ class World:
             client.resetJointState(body, joint, angle, speed)
 
     def _to_centre(self, i: int) -> Array:
-        """From the trunk's frame to its centre of mass, in the world, (3,) m."""
+        """Vector from the trunk's origin to its centre of mass in the world frame, (3,) m."""
         return np.asarray(rotation_matrix(self.state.quaternion[i : i + 1])[0] @ self._centre)
 
     def _place_trunk(self, i: int, position: Array) -> None:
-        """Bring the trunk of robot ``i`` to ``position`` (3,), turned as ``state`` has it."""
+        """Move the trunk of robot ``i`` to ``position`` (3,), with its orientation in ``state``."""
         self._client_of[i].resetBasePositionAndOrientation(
             self._bodies[i],
             position + self._to_centre(i),
@@ -295,14 +296,14 @@ class World:
         )
 
     def _move_trunk(self, i: int) -> None:
-        """Let the trunk of robot ``i`` move as ``state`` has it."""
+        """Give the trunk of robot ``i`` its velocities in ``state``."""
         lin_vel, ang_vel = self.state.lin_vel[i], self.state.ang_vel[i]
         self._client_of[i].resetBaseVelocity(
             self._bodies[i], lin_vel + np.cross(ang_vel, self._to_centre(i)), ang_vel
         )
 
     def _read_trunks(self, live: NDArray[np.integer]) -> None:
-        """Fill ``state`` with where the trunks of the robots ``live`` are and how they move."""
+        """Read the trunk poses and velocities of the robots ``live`` into ``state``."""
         robots = [(self._bodies[i], self._client_of[i].id) for i in live]
         poses = [pybullet.getBasePositionAndOrientation(*robot) for robot in robots]
         speeds = [pybullet.getBaseVelocity(*robot) for robot in robots]
@@ -318,11 +319,11 @@ class World:
         state.ang_vel[live] = ang_vel
 
     def forget(self) -> None:
-        """Let Bullet forget the contacts of the steps before; ``state`` stays as it is.
+        """Make Bullet forget the contacts of earlier steps; ``state`` stays as it is.
 
-        Bullet starts its solver from the last step's contact forces. Afterwards what follows is
-        what would follow in a world rebuilt with the same ``state``, strength and dynamics, bit
-        for bit. For that every robot spends one physics step high above the ground.
+        Bullet warm-starts its solver with the last step's contact forces. After this call the
+        simulation continues, bit for bit, as in a world rebuilt with the same ``state``, strength
+        and dynamics. To this end every robot spends one ``stepSimulation`` high above the ground.
         """
         for i in self._active:
             self._place_trunk(int(i), self.state.position[i] + [0.0, 0.0, _PARKED])
@@ -332,7 +333,8 @@ class World:
             self._put(int(i))
 
     def _inertia_about_joint(self, joint: int) -> tuple[list[float], int]:
-        """Principal inertia of a joint's link, (3,) kg m^2, and which is nearest to its axis."""
+        """Principal inertia of a joint's link, (3,) kg m^2, and the index of the principal axis
+        closest to the joint's."""
         client, body = self._client_of[0], self._bodies[0]
         inertia, _, turned = client.getDynamicsInfo(body, joint)[2:5]
         axis = np.array(client.getJointInfo(body, joint)[13])
@@ -342,10 +344,10 @@ class World:
     def set_dynamics(
         self, index: ArrayLike, friction: Array, payload: Array, armature: Array
     ) -> None:
-        """Friction of every link, extra mass of the trunk, rotor inertia of the joints.
+        """Set the friction of all links, the trunk's payload and the rotor inertia of the joints.
 
-        Bullet's joints have no inertia of their own, so it is the links' about their joints; other
-        than a rotor's it also resists a turn of all links together.
+        Bullet's joints have no inertia of their own, so it is added to the links' inertia about
+        their joints. Unlike a rotor's, it also resists rotation of all links together.
 
         Args:
             index: (n,) robots.
@@ -363,7 +365,7 @@ class World:
                 about = inertia.copy()
                 about[axis] += float(armature[k])
                 client.changeDynamics(body, joint, localInertiaDiagonal=about)
-            # Spread over the trunk, the payload scales its inertia.
+            # The payload is spread over the trunk, so the inertia scales with the mass.
             client.changeDynamics(
                 body,
                 _TRUNK,
@@ -372,7 +374,7 @@ class World:
             )
 
     def push(self, index: ArrayLike, velocity: Array) -> None:
-        """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index``; refreshes
+        """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index``, and refresh
         ``state``."""
         state = self.state
         for k, i in enumerate(np.asarray(index)):
@@ -381,17 +383,17 @@ class World:
         state.derive()
 
     def retire(self, index: ArrayLike) -> None:
-        """Take the robots ``index`` out for good; their rows of ``state`` stay as they are."""
+        """Remove the robots ``index`` permanently; their rows of ``state`` stay as they are."""
         for i in np.asarray(index):
             self._client_of[i].removeBody(self._bodies[i])
         self._active = np.setdiff1d(self._active, index)
 
     def step(self, targets: Array, delay: Array, offset: Array) -> None:
-        """One control step of PD control.
+        """Simulate one control step of PD control.
 
         Args:
             targets: (H, M, 12) rad, the joint targets of this control step and the H-1 before.
-            delay: (M,) s from a decision to its effect, below H control steps.
+            delay: (M,) s until a target takes effect, at most H-1 control steps.
             offset: (M, 12) rad, error of each joint's zero.
         """
         live, state = self._active, self.state
@@ -406,8 +408,8 @@ class World:
         self._read_contacts()
 
     def _wanted(self, targets: Array, delay: Array, offset: Array) -> Array:
-        """Targets of each of k joint controls, (k, n, 12) rad for the n active robots: those of the
-        control step that has taken effect by then."""
+        """Joint targets of the n active robots at each of k joint controls, (k, n, 12) rad: those
+        of the latest control step that has taken effect by then."""
         live = self._active
         interval = self.physics.hold * self.physics.dt
         passed = interval * np.arange(self.physics.joint_steps)[:, None]
@@ -415,15 +417,16 @@ class World:
         return np.asarray(targets[age.astype(int), live] + offset[live])
 
     def _step_client(self, client: _Client, live: NDArray[np.integer], wanted: Array) -> None:
-        """All physics steps of one client's robots ``live`` (n,), with ``wanted`` (k, n, 12) rad,
-        their joint targets at each of k joint controls.
+        """Run all physics steps of one client's robots ``live`` (n,), with joint targets ``wanted``
+        (k, n, 12) rad at each of k joint controls.
 
-        One client after another, since the processor's cache holds one but not all: with 50 robots
-        in 5 clients Bullet took half as long again when they took turns at every physics step.
+        Clients run one after another because the CPU cache holds one of them but not all: with 50
+        robots in 5 clients, Bullet took 1.5 times as long when they alternated at every physics
+        step.
         """
         joints, state = self._joints, self.state
         bodies = [self._bodies[i] for i in live]
-        # At these calls, one a robot and physics step, even a client's bound functions are slow.
+        # Called for every robot and joint control; even a client's bound functions are too slow.
         command, measure = pybullet.setJointMotorControlArray, pybullet.getJointStates
         strength, friction = self.strength[live], self.joint_friction[live]
         q, qd = state.q[live], state.qd[live]
@@ -441,7 +444,7 @@ class World:
                 np.fromiter(map(itemgetter(k), flat), np.float64, len(flat)).reshape(q.shape)
                 for k in (0, 1)
             )
-            pressed: dict[int, float] = {}  # row -> N on its trunk, none most of the time
+            pressed: dict[int, float] = {}  # row -> N on its trunk, usually empty
             for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=_TRUNK):
                 row = client.rows[contact[2]]
                 pressed[row] = pressed.get(row, 0.0) + self._force(contact)
@@ -450,16 +453,18 @@ class World:
         state.q[live], state.qd[live], state.torque[live] = q, qd, torque
 
     def _force(self, contact: tuple[Any, ...]) -> float:
-        """Normal force of a contact in N: Bullet divides the impulse of its last internal step by
-        the time of all of them."""
+        """Normal force of a contact in N.
+
+        Bullet divides the impulse of its last internal step by the duration of all of them.
+        """
         return float(contact[9] * self.physics.hold)
 
     def _read_contacts(self) -> None:
-        """Forces of the last physics step, split into feet and the legs above them.
+        """Read the forces of the last physics step on the feet and on the legs above them.
 
         The foot is the end of the calf link, so a calf contact counts as the foot's when it is
-        within reach of the foot's centre. Plain lists: indexing arrays one contact at a time
-        would take longer than all the rest of a step.
+        within reach of the foot's centre. The sums are plain lists, because indexing arrays one
+        contact at a time would take longer than the rest of a step.
         """
         feet = self.state.foot_position.tolist()
         foot_force = [[0.0] * 4 for _ in range(self.num_robots)]
@@ -482,11 +487,11 @@ class World:
         self.state.leg_force = np.array(leg_force)
 
     def ground_height(self, x: Array, y: Array) -> Array:
-        """Surface height in m under points of any shape."""
+        """Surface height in m at points ``x``, ``y``, arrays of any shape."""
         return np.zeros_like(x) if self.field is None else self.field.height_at(x, y)
 
     def support_height(self, x: Array, y: Array) -> Array:
-        """Height in m of the support surface of the fall rule: trenches filled, no pillars."""
+        """Height in m of the fall rule's support surface: trenches filled, pillars removed."""
         return np.zeros_like(x) if self.field is None else self.field.support_at(x, y)
 
     def picture(
@@ -499,11 +504,11 @@ class World:
         distance: float = 1.4,
         target: Array | None = None,
     ) -> NDArray[np.uint8]:
-        """Robot ``row`` and its ground from the side, (height, width, 3), without a display.
+        """Render robot ``row`` and its ground, (height, width, 3); needs no display.
 
-        The camera looks at ``target`` (3,) m, the trunk by default, from ``distance`` m away:
-        ``azimuth`` rad from the world's x axis and ``elevation`` rad above the target. Worlds that
-        were not made with ``visual`` have nothing to show.
+        The camera looks at ``target`` (3,) m, the trunk by default, from ``distance`` m away,
+        ``azimuth`` rad from the world's x axis and ``elevation`` rad above the target. The world
+        must have been created with ``visual``.
         """
         client = self._client_of[row]
         target = self.state.position[row] if target is None else target
@@ -518,38 +523,38 @@ class World:
             lightDirection=[0.5, -1.0, 2.0],
         )
         image = np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
-        image[np.reshape(bodies, (height, width)) < 0] = _SKY  # -1 is no body
+        image[np.reshape(bodies, (height, width)) < 0] = _SKY  # -1: background
         return image
 
     def close(self) -> None:
-        """Disconnect from Bullet; the world is of no use afterwards."""
+        """Disconnect from Bullet; the world cannot be used afterwards."""
         for client in self._clients:
-            if client.isConnected():  # a window may have been closed by hand
+            if client.isConnected():  # the user may have closed the window
                 client.disconnect()
         self._clients.clear()
 
 
 def check_robot(robot: RobotConfig, physics: PhysicsConfig) -> None:
-    """See that such a robot can be simulated.
+    """Check that the robot can be simulated.
 
     Raises:
-        ConfigError: a URDF that cannot be used; names it.
+        ConfigError: an unusable URDF; the message names it.
     """
     World(1, robot, physics).close()
 
 
 class WindowError(RuntimeError):
-    """Bullet's window cannot be opened, or was closed; the message is one line."""
+    """Bullet's window cannot be opened or was closed; the message is one line."""
 
 
 def check_display() -> None:
-    """Ask for a display before Bullet does: it would end the whole process without one.
+    """Check for a display, because Bullet ends the whole process without one.
 
     Raises:
-        WindowError: there is none.
+        WindowError: no display, or no libX11 to reach it.
     """
     if sys.platform != "linux":
-        return  # elsewhere the system always has one
+        return  # other systems always have one
     name = os.environ.get("DISPLAY", "")
     try:
         x11 = ctypes.CDLL("libX11.so.6")
@@ -564,14 +569,14 @@ def check_display() -> None:
 
 
 class Stage(World):
-    """One robot on its tile, moved by hand and not simulated: for films and Bullet's window.
+    """One robot on its tile, posed rather than simulated, for films and Bullet's window.
 
     Args:
         robot, physics, field: as in ``World``.
         window: open Bullet's window.
 
     Raises:
-        WindowError: no display.
+        WindowError: ``window`` without a display.
     """
 
     def __init__(
@@ -590,11 +595,11 @@ class Stage(World):
                 pybullet.COV_ENABLE_SEGMENTATION_MARK_PREVIEW,
             ):
                 self._client.configureDebugVisualizer(flag, 0)
-            # As the films have it: from behind, to the right and above.
+            # The camera of the films: behind the robot, to its right and above.
             self._client.resetDebugVisualizerCamera(1.8, -50.0, -29.0, [0.0, 0.0, 0.0])
 
     def show(self, position: Array, quaternion: Array, q: Array) -> None:
-        """Put the robot at ``position`` (3,), ``quaternion`` (4,) with joint angles ``q`` (12,).
+        """Place the robot at ``position`` (3,), ``quaternion`` (4,) with joint angles ``q`` (12,).
 
         Raises:
             WindowError: the window was closed.
@@ -603,14 +608,15 @@ class Stage(World):
             self.reset_robots([0], position[None], quaternion[None], q[None])
 
     def paint(self, texture: Path) -> None:
-        """Lay a picture over the tile: its rows run along y, its columns against x."""
+        """Texture the tile with an image whose row index grows along y, its column index against
+        x."""
         image = self._client.loadTexture(str(texture))
         self._client.changeVisualShape(
             self._client.ground, -1, textureUniqueId=image, rgbaColor=[1.0] * 4
         )
 
     def mark(self, foot: Array, colour: tuple[float, float, float]) -> None:
-        """A pole with a ball on top, 0.8 m tall, its foot at ``foot`` (3,) m."""
+        """Add a pole with a ball on top, 0.8 m tall, that stands at ``foot`` (3,) m."""
         for kind, height, size in (
             (pybullet.GEOM_CYLINDER, 0.4, {"radius": 0.015, "length": 0.8}),
             (pybullet.GEOM_SPHERE, 0.8, {"radius": 0.06}),
@@ -621,11 +627,12 @@ class Stage(World):
     # ------------------------------------------------------------------ the window
 
     def add_slider(self, name: str, low: float, high: float, start: float) -> None:
-        """A slider in the window; where ``low`` is above ``high``, a button that counts."""
+        """Add a slider to the window or, if ``low`` is above ``high``, a button that counts its
+        clicks."""
         self._sliders.append(self._client.addUserDebugParameter(name, low, high, start))
 
     def read_sliders(self) -> Array:
-        """Where all sliders stand, in the order in which they were added.
+        """Values of all sliders, in the order in which they were added.
 
         Raises:
             WindowError: the window was closed.
@@ -634,7 +641,8 @@ class Stage(World):
             return np.array([self._client.readUserDebugParameter(i) for i in self._sliders])
 
     def follow(self, text: str) -> None:
-        """Turn the window's camera to the robot, as far and from where it is; ``text`` above it.
+        """Point the window's camera at the robot from the current distance and direction, and
+        write ``text`` above the robot.
 
         Raises:
             WindowError: the window was closed.
@@ -643,7 +651,7 @@ class Stage(World):
         with self._in_window():
             yaw, pitch, distance = self._client.getDebugVisualizerCamera()[8:11]
             self._client.resetDebugVisualizerCamera(distance, yaw, pitch, position.tolist())
-            # Bullet writes from there to the right, so that begins at the left of the robot.
+            # Bullet writes to the right of this place, so it is to the left of the robot.
             turn, away = np.radians(yaw), 0.35 * distance
             place = position + [-away * np.cos(turn), -away * np.sin(turn), 0.35]
             self._text = self._client.addUserDebugText(
@@ -652,7 +660,7 @@ class Stage(World):
 
     @contextlib.contextmanager
     def _in_window(self) -> Iterator[None]:
-        """Bullet's errors in here are the window's, where that was closed."""
+        """Raise a ``WindowError`` for Bullet's errors in the block, if the window was closed."""
         try:
             yield
         except pybullet.error as error:

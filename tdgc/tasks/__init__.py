@@ -1,1 +1,1 @@
-"""The two MDPs, their rewards, curricula and the scripted teacher."""
+"""The two MDPs with their rewards and curricula, and the scripted teacher."""

@@ -1,4 +1,4 @@
-"""How fast robots come nearer to their goals, from one decision to the next."""
+"""How fast robots close in on their goals, from one decision to the next."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,15 +8,15 @@ from tdgc.sim.robot import Array
 
 
 class Approach:
-    """The closing speeds of M robots: what two readings of the goal say of the trunk's speed.
+    """Closing speeds of M robots, from their distances to the goal at successive decisions.
 
     Args:
         loco: the robots.
-        seconds: between two decisions.
+        seconds: time between two decisions, s.
 
     Attributes:
-        distance: (M,) m from the goal at the last decision.
-        speed: (M,) m/s since the decision before it; 0 at the first one of an episode.
+        distance: (M,) m to the goal at the latest decision.
+        speed: (M,) m/s towards the goal since the decision before; 0 at the start of an episode.
     """
 
     def __init__(self, loco: Locomotion, seconds: float) -> None:
@@ -24,11 +24,11 @@ class Approach:
         self.distance, self.speed = np.zeros((2, loco.num_robots))
 
     def begin(self, index: NDArray[np.integer], goal: Array) -> None:
-        """Start over for the robots ``index`` (n,); ``goal`` (M, 2) m in the world."""
+        """Start new episodes for the robots ``index`` (n,); ``goal`` (M, 2) m in the world."""
         self.distance[index], self.speed[index] = self._measure(goal)[index], 0.0
 
     def measure(self, goal: Array) -> None:
-        """The distance at the next decision."""
+        """Update distances and speeds, once per decision."""
         now = self._measure(goal)
         self.speed[:], self.distance[:] = (self.distance - now) / self._seconds, now
 

@@ -11,27 +11,27 @@ from tdgc.sim.gaits import GAITS
 from tdgc.sim.robot import Array
 from tdgc.tasks.leaps import LONGEST
 
-_FALLS = 256  # of a task's robots, the last ones: a few minutes of walking
-# Of ``low_statistics.by_gait``, what a gait is judged by: samples, and sums over them.
+_FALLS = 256  # latest falls of a task's robots: those of a few minutes of walking
+# The sums of ``low_statistics.by_gait`` that a gait is judged by; the first counts its samples.
 _JUDGED = ("steps", "track_lin_vel", "track_yaw_rate", "match")
 PRONK = GAITS.index("pronk")
 
 
 class CommandDraw:
-    """Draws commands; a gait begins with a share of the velocity ranges, which grows.
+    """Draws commands; each gait starts with a share of the velocity ranges, which grows.
 
     Args:
         config: the MDP.
-        rng: what is drawn from.
-        training: begin with ``command_start`` of the velocity ranges, and let them grow; otherwise
-            they are whole.
+        rng: source of all random draws.
+        training: start with ``command_start`` of the velocity ranges and widen them; otherwise the
+            full ranges are used.
 
     Attributes:
         share: (4,) share of the velocity ranges that each gait uses.
-        scores: (4, 4) sums for each gait since it was last judged: samples, what tracking of
-            velocity and of yaw rate earned, and shares of feet in contact as desired.
-        falls: (256, 13) gait and continuous commands that robots fell at, the last one first; gait
-            -1 where there were none yet.
+        scores: (4, 4) sums for each gait since it was last judged: samples, tracking rewards of
+            velocity and of yaw rate, and shares of feet in contact as desired.
+        falls: (256, 13) gait and continuous commands during which robots fell, newest first; the
+            gait of an empty row is -1.
     """
 
     def __init__(self, config: LowLevelConfig, rng: np.random.Generator, training: bool) -> None:
@@ -43,8 +43,8 @@ class CommandDraw:
         self.falls = np.full((_FALLS, 1 + len(CONTINUOUS)), -1.0)
 
     def bounds(self, n: int) -> tuple[Array, Array, Array]:
-        """What n free commands are drawn from: probabilities of the gaits, (n, 4), and lower and
-        upper bounds of the continuous commands, (n, 12), of the velocities before they grow."""
+        """Distribution of n free commands: gait probabilities, (n, 4), and lower and upper bounds
+        of the continuous commands, (n, 12), before ``share`` scales the velocities."""
         gaits, low, high = (
             np.tile(each, (n, 1))
             for each in (self._config.command_draw.gaits, self._low, self._high)
@@ -54,10 +54,13 @@ class CommandDraw:
     def draw(
         self, gaits: Array, low: Array, high: Array, free: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
-        """Gaits (n,) and continuous commands (n, 12) from such ``bounds``, and which of them (n,)
-        are tried again; of the ``free`` ones (n,) some leap, and some are what robots fell at. In
-        pronk the steps are at least as quick as ``leaps.LONGEST`` asks for, and the speed is what
-        the quickest of them allow."""
+        """Draw gaits (n,) and continuous commands (n, 12) from such ``bounds``.
+
+        Of the ``free`` commands (n,), some become leaps and some repeat commands during which a
+        robot fell; the third result marks these repeats, (n,). In pronk the frequency is raised
+        until strides are no longer than ``leaps.LONGEST``; where the highest one does not suffice,
+        the speed is reduced.
+        """
         n, rng, config = len(free), self._rng, self._config.command_draw
         gait = np.sum(rng.uniform(size=(n, 1)) > np.cumsum(gaits, axis=1)[:, :-1], axis=1)
         values = rng.uniform(low, high)
@@ -80,13 +83,16 @@ class CommandDraw:
         return gait, values, again
 
     def remember(self, command: Array) -> None:
-        """Commands (n, 15) that robots have just fallen at."""
+        """Store commands (n, 15) during which robots have just fallen."""
         fallen = np.column_stack([gait_index(command), command[:, : len(CONTINUOUS)]])
         self.falls = np.concatenate([fallen, self.falls])[:_FALLS]
 
     def judge(self, sums: Mapping[str, Array], num_robots: int) -> None:
-        """Add the sums of a step of M robots, as ``by_gait`` has them; widen the velocity ranges of
-        a gait that was tracked well over enough of them, and judge it from the next step on."""
+        """Add the sums of a step of ``num_robots`` robots, as returned by ``by_gait``.
+
+        A gait with enough samples is judged: if it was tracked well, its velocity ranges widen. Its
+        sums then start again from zero.
+        """
         config, weights = self._config.command_draw, self._config.rewards
         self.scores += np.stack([sums[name] for name in _JUDGED], axis=1)
         for g in np.flatnonzero(self.scores[:, 0] >= config.growth_steps * num_robots / len(GAITS)):
@@ -100,5 +106,5 @@ class CommandDraw:
 
     def grown(self) -> Array:
         """How far the velocity ranges of each gait have grown, (4,), from 0 at the start to 1."""
-        start = min(self._config.command_start, 1.0 - 1e-6)  # ranges whole from the start
+        start = min(self._config.command_start, 1.0 - 1e-6)  # avoids 0 / 0 for a start at 1
         return (self.share - start) / (1.0 - start)

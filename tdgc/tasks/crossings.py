@@ -1,7 +1,8 @@
-"""Crossings: training episodes that lead over a tile, as the high policy will ask for.
+"""Crossings: training episodes that lead across a tile, as the high policy will ask for.
 
-A robot that crosses is steered from platform to platform along a waypoint, facing where it goes or
-any other way; its pitch follows the slope, and over trenches most leap. Levels rise with crossings.
+A crossing robot is steered from the start platform to a waypoint on the goal platform, facing the
+way it goes or any other direction. Its pitch follows the slope to a random degree, and over
+trenches most robots leap. Levels rise with successful crossings.
 """
 
 from collections.abc import Sequence
@@ -24,13 +25,13 @@ from tdgc.tasks.tiles import FLAT
 Ints = NDArray[np.int64]
 _YAW_RATE, _PITCH = INDEX["yaw_rate"], INDEX["pitch"]
 _FREQUENCY, _LENGTH = INDEX["frequency"], INDEX["stance_length"]
-# m from a lip, further than leaps have to be: what is learned here is to land where it is asked for
+# m from a lip, further than leaps need: what is learned here is to land where commanded.
 _CLEAR = 0.08
 
 
 def within(velocity: Array, low: Array, high: Array) -> Array:
-    """Velocities (M, 2) as fast as their bounds (2,) allow in their directions; a component that
-    must be zero is left out instead of ending all of the motion."""
+    """Velocities (M, 2) scaled down to their bounds (2,) with their directions kept; a component
+    whose bound is zero is dropped instead of stopping the whole motion."""
     bound = np.where(velocity < 0.0, -low, high)
     free = bound > 0.0
     over = np.where(free, np.abs(velocity) / np.where(free, bound, 1.0), 0.0)
@@ -42,14 +43,14 @@ class Crossings:
 
     Args:
         config: the MDP.
-        families: of the robots' tiles, (M,) names; on flat ones nobody crosses.
-        episodes: of the robots, changed in place.
-        rng: what is drawn from.
+        families: (M,) names of the tiles' families; on flat tiles no robot crosses.
+        episodes: the robots' episodes, changed in place.
+        rng: source of all random draws.
 
     Attributes:
-        flat: (M,) whose tiles are.
-        leapers: (M,) whose tiles have trenches.
-        landing: of the low policy as it is now, learned from its leaps.
+        flat: (M,) robots on flat tiles.
+        leapers: (M,) robots on tiles with trenches.
+        landing: that of the current low policy, learned from its leaps.
         spread: (M,) m, ``landing.spread`` as it was when each robot's leaps were planned.
     """
 
@@ -75,7 +76,7 @@ class Crossings:
         self.plan(field, index)
 
     def plan(self, field: TileField, index: NDArray[np.integer]) -> None:
-        """Plan the leaps of the robots ``index`` (n,), with the ``spread`` of when they looked."""
+        """Plan the leaps of the robots ``index`` (n,) with the ``spread`` stored by ``look``."""
         for i in index[self.leapers[index]]:
             trenches = field.features[int(i), 0].trenches
             self._plan.look(int(i), trenches, float(self.spread[i]))
@@ -83,11 +84,11 @@ class Crossings:
     # ------------------------------------------------------------------ what is drawn
 
     def begin(self, index: NDArray[np.integer], origin: Array, goal: Array) -> None:
-        """Draw who of the robots ``index`` (n,) crosses in its new episode.
+        """Draw which of the robots ``index`` (n,) cross in their new episodes.
 
         Args:
-            index: whose episodes begin.
-            origin, goal: (n, 2) m in the world, of the tiles and on them.
+            index: robots whose episodes begin.
+            origin, goal: (n, 2) m in the world, the tiles' origins and the goals on them.
         """
         e = self._episodes
         e.origin[index], e.waypoint[index] = origin, goal
@@ -97,11 +98,11 @@ class Crossings:
     def narrow(
         self, index: NDArray[np.integer], levels: Ints, gaits: Array, low: Array, high: Array
     ) -> None:
-        """Narrow, in place, what commands of the robots ``index`` (n,) are drawn from, see
-        ``CommandDraw.bounds``, where they cross tiles of their ``levels`` (M,).
+        """Narrow ``CommandDraw.bounds`` in place for those of the robots ``index`` (n,) that cross.
 
-        A foot that must clear a 15 cm step, or a trunk that bends away from a 0.4 rad slope, cannot
-        follow the rest and learns nothing from it.
+        The higher a robot's level in ``levels`` (M,), the narrower its bounds: a foot that must
+        clear a 15 cm step, or a trunk that bends away from a 0.4 rad slope, cannot follow the other
+        commands and learns nothing from them.
         """
         c, crossing = self._config, self._episodes.crossing[index]
         gaits[crossing] = c.gaits
@@ -115,10 +116,13 @@ class Crossings:
         high[:, bend] *= (1.0 - (1.0 - c.bend) * d)[:, None]
 
     def draw(self, index: NDArray[np.integer], gait: Ints, values: Array, grown: float) -> None:
-        """Draw how the robots ``index`` (n,) cross with the gaits (n,) and continuous commands
-        (n, 12) drawn for them; those of leaps are changed in place, but for posture. Leaps are
-        ``grown`` times as fast as they will be: the share of the velocity ranges that pronk
-        has come to."""
+        """Draw how the robots ``index`` (n,) cross, given their gaits (n,) and continuous commands
+        (n, 12).
+
+        For leaps, swing height, duty factor, frequency and stance length are overwritten in place,
+        and the speed is multiplied by ``grown``, the share of the velocity ranges that pronk has
+        reached.
+        """
         n, rng, c, e = len(index), self._rng, self._config, self._episodes
         leaps = e.crossing[index] & self.leapers[index] & (gait == PRONK)
         swing = INDEX["swing_height"]
@@ -126,8 +130,8 @@ class Crossings:
         highest = np.clip(SWING_HEIGHT, low, self._high[swing])
         values[leaps, swing] = rng.uniform(low, highest, int(leaps.sum()))
         for j, usual in (
-            (INDEX["duration"], DURATION),  # which landings are planned for
-            (_FREQUENCY, SPEED / STRIDE),  # until the first of them is
+            (INDEX["duration"], DURATION),  # that landings are planned for
+            (_FREQUENCY, SPEED / STRIDE),  # until the first landing is planned
             (_LENGTH, STRIDE),
         ):
             values[leaps, j] = np.clip(usual, self._low[j], self._high[j])
@@ -143,7 +147,7 @@ class Crossings:
     # ------------------------------------------------------------------ step by step
 
     def steer(self, loco: Locomotion, ground: Ground) -> None:
-        """Point the commands of those that cross at their waypoints; note who arrives."""
+        """Point the commands of crossing robots at their waypoints, and record arrivals."""
         e, state, command = self._episodes, loco.world.state, loco.command
         rows = np.flatnonzero(e.crossing)
         if not rows.size:
@@ -179,7 +183,7 @@ class Crossings:
             loco.command[rows, _FREQUENCY], loco.command[rows, _LENGTH] = frequency, length
 
     def learn_landing(self, loco: Locomotion, clock: Array) -> None:
-        """Learn from the leaps of a step where feet land; ``clock`` (M,) is from before it."""
+        """Learn where feet land from the leaps of a step; ``clock`` (M,) is from before it."""
         rows = np.flatnonzero(self._episodes.leaping)
         self.landing.learn(loco, rows, clock[rows], self._config.landing_rate)
 
@@ -188,14 +192,14 @@ class Crossings:
     ) -> Ints:
         """Levels (M,) after a step, moved as legged_gym does.
 
-        Up when the tile was crossed; down when too little of it was; a robot that crosses the last
-        level starts over at a random one.
+        A robot moves up when it has crossed its tile, and down when it got less far than the share
+        ``demotion`` of the tile; one that crosses the last level continues on a random one.
 
         Args:
-            levels: (M,) before.
-            x: (M,) m, how far along their tiles the robots are.
-            ended: (M,) whose episodes end with this step.
-            tried: (M,) of these the ones that fell or had all of an episode's time.
+            levels: (M,) levels before the step.
+            x: (M,) m, the robots' positions along their tiles.
+            ended: (M,) robots whose episodes end with this step.
+            tried: (M,) those of them that fell or used the full time of an episode.
         """
         e, c = self._episodes, self._config
         crossed = ended & e.crossing & e.reached

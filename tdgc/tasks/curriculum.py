@@ -1,19 +1,19 @@
 """The curriculum over terrain levels: promotion and demotion of each environment (Sec. IV-C).
 
-Each environment keeps the outcomes of its last W episodes. When there are W of them, with c
-successes among them and a threshold S, the paper's two rules apply::
+Each environment keeps the outcomes of its last W episodes. Once W are recorded, with c successes
+among them and a threshold S, the paper's two rules apply::
 
     c >= S          ->  level = min(level + 1, L_max - 1)
     c <  W - S + 1  ->  level = max(level - 1, 0)
 
-Levels run from 0 to L_max - 1, so ``max_level`` is how many there are: 11 for levels 0 to 10.
+Levels run from 0 to L_max - 1, so ``max_level`` is the number of levels: 11 for levels 0 to 10.
 
-The paper describes the window twice and not alike. Its text says a *sliding* window that is
-reset "after a level change"; its Algorithm 1 clears the window every time it was full. Here it
-is as the text has it: the rules are tried after every episode once the window is full, and a
-window that left the level where it was goes on sliding. The two differ only for an environment
-that has held its level: the text's reacts within an episode, Algorithm 1's within W. At the top
-(or bottom) level a further promotion (or demotion) is no change, so that window slides too.
+The paper describes the window in two different ways. Its text has a *sliding* window that is reset
+"after a level change"; its Algorithm 1 clears the window every time it is full. This module follows
+the text: once the window is full, the rules are tried after every episode, and a window that leaves
+the level unchanged keeps sliding. The two differ only for an environment that has held its level:
+the text's version reacts within one episode, Algorithm 1 within W. At the top (or bottom) level a
+further promotion (or demotion) changes nothing, so there, too, the window keeps sliding.
 """
 
 from collections.abc import Mapping
@@ -27,8 +27,8 @@ Ints = NDArray[np.int64]
 def check_rules(window: int, threshold: int, max_level: int) -> None:
     """Raise ``ValueError`` unless (window + 1) / 2 < threshold <= window and max_level >= 1.
 
-    With a lower threshold the same count could promote and demote, or would always do one of the
-    two; with a higher one nothing would ever promote.
+    With a lower threshold, the same count could both promote and demote, or every count would do
+    one of the two; with a higher one, nothing would ever promote.
     """
     if not (window + 1) / 2 < threshold <= window:
         raise ValueError(
@@ -42,11 +42,11 @@ def check_rules(window: int, threshold: int, max_level: int) -> None:
 def update_level(
     level: ArrayLike, successes: ArrayLike, window: int, threshold: int, max_level: int
 ) -> Ints:
-    """The level after a full window (Sec. IV-C, the two rules).
+    """Apply the two rules of Sec. IV-C to a full window.
 
     Args:
-        level: level now, any shape, in 0..max_level - 1.
-        successes: successful episodes among the last ``window``, same shape.
+        level: current level, any shape, in 0..max_level - 1.
+        successes: number of successful episodes among the last ``window``, same shape.
         window: W, episodes.
         threshold: S, episodes.
         max_level: L_max, the number of levels.
@@ -55,7 +55,7 @@ def update_level(
         The new level, same shape.
 
     Raises:
-        ValueError: rules that overlap, see ``check_rules``.
+        ValueError: invalid rules, see ``check_rules``.
     """
     check_rules(window, threshold, max_level)
     now, count = np.asarray(level, dtype=np.int64), np.asarray(successes)
@@ -65,13 +65,12 @@ def update_level(
 
 
 class Curriculum:
-    """Levels and windows of ``n`` environments, each on its own.
+    """Levels and windows of ``n`` independent environments.
 
     Attributes:
-        levels: (n,), the level of each environment; read it, and let ``push`` change it.
-        outcomes: (n, window) of bool, oldest episode first; empty places come first and are
-            False.
-        counts: (n,), how many of those places are filled.
+        levels: (n,), the level of each environment; callers read it, ``push`` changes it.
+        outcomes: (n, window) of bool, oldest episode first; empty slots come first and are False.
+        counts: (n,), how many slots are filled.
     """
 
     def __init__(
@@ -80,7 +79,7 @@ class Curriculum:
         """Start all environments at level ``start``, one number or (n,), with empty windows.
 
         Raises:
-            ValueError: rules that overlap, see ``check_rules``, or a start outside the levels.
+            ValueError: invalid rules, see ``check_rules``, or a start outside the levels.
         """
         check_rules(window, threshold, max_level)
         self.window, self.threshold, self.max_level = window, threshold, max_level
@@ -91,27 +90,27 @@ class Curriculum:
         self.counts: Ints = np.zeros(n, dtype=np.int64)
 
     def push(self, envs: ArrayLike, successes: ArrayLike) -> Ints:
-        """Record one finished episode for each of some environments and move their levels.
+        """Record one finished episode for each given environment and update its level.
 
         The order is that of Algorithm 1: push the outcome; if the window is full, count and
         update the level; if the level changed, clear the window.
 
         Args:
-            envs: which environments: k different indices, or a mask (n,) with k of them True.
+            envs: the environments: k distinct indices, or a mask (n,) with k True entries.
             successes: (k,) of bool, in the order of ``envs``.
 
         Returns:
             The change of level, (k,): -1, 0 or 1.
 
         Raises:
-            ValueError: an index twice or out of range, or shapes that do not fit.
+            ValueError: a duplicate or out-of-range index, or shapes that do not match.
         """
         who = np.asarray(envs)
         if who.dtype == bool:
             if who.shape != self.levels.shape:
                 raise ValueError(f"the mask has shape {who.shape}, not {self.levels.shape}")
             who = np.flatnonzero(who)
-        who = who.astype(np.int64)  # an empty list comes as floats
+        who = who.astype(np.int64)  # an empty list becomes a float array
         success = np.asarray(successes, dtype=bool)
         if who.ndim != 1 or success.shape != who.shape:
             raise ValueError(f"{who.shape} environments but {success.shape} successes")
@@ -135,7 +134,7 @@ class Curriculum:
         return change
 
     def state_dict(self) -> dict[str, NDArray[np.generic]]:
-        """Everything that ``push`` changes, as copies, for an exact resume."""
+        """Copies of everything that ``push`` changes, for an exact resume."""
         return {
             "levels": self.levels.copy(),
             "outcomes": self.outcomes.copy(),
@@ -143,11 +142,11 @@ class Curriculum:
         }
 
     def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
-        """Go on from a ``state_dict`` of a curriculum with the same sizes and rules.
+        """Resume from the ``state_dict`` of a curriculum with the same sizes and rules.
 
         Raises:
-            ValueError: other keys or shapes, or a level or count that is out of range; nothing
-                is changed then.
+            ValueError: wrong keys or shapes, or a level or count out of range; the curriculum is
+                then left unchanged.
         """
         mine = self.state_dict()
         if set(state) != set(mine):

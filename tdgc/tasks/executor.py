@@ -11,26 +11,26 @@ from tdgc.sim.sensors import Noise
 
 
 class Acts(Protocol):
-    """What the executor needs of a low policy."""
+    """What the executor needs from a low policy."""
 
     def predict(self, obs: NDArray[np.float32]) -> tuple[NDArray[np.floating], Any]:
-        """Observations (n, d) -> actions (n, 12), and what does not matter here."""
+        """Observations (n, d) -> actions (n, 12), and a second value that is ignored here."""
 
 
 class Carries(Protocol):
-    """What the closed loop needs of an executor."""
+    """What the closed loop needs from an executor."""
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
-        """One control step under ``commands`` (M, 15), in which the robots ``rows`` (n,) act."""
+        """Run one control step under ``commands`` (M, 15); the robots ``rows`` (n,) act."""
 
 
 class Executor:
-    """Robots that carry commands out by a frozen low policy.
+    """M robots that follow commands through a frozen low policy.
 
     Args:
         loco: the M robots.
         low: the low policy.
-        noise: of what it observes, drawn at each control step; None for exact sensors.
+        noise: sensor noise, drawn at each control step; None for exact sensors.
     """
 
     def __init__(self, loco: Locomotion, low: Acts, noise: Noise | None = None) -> None:
@@ -38,18 +38,18 @@ class Executor:
         self._actions = np.zeros((loco.num_robots, NUM_JOINTS), dtype=np.float32)
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
-        """One control step: commands -> low policy -> joint targets -> physics.
+        """Run one control step: commands -> low policy -> joint targets -> physics.
 
         Args:
             commands: (M, 15).
-            rows: (n,) the robots that decide; the others keep their last action. All by default.
+            rows: (n,) the robots that act; the others repeat their last action. All by default.
         """
         self.loco.command[:] = commands
         seen = self.loco.observe(self._noise)
         rows = np.arange(len(seen)) if rows is None else rows
         actions, _ = self._low.predict(seen[rows])
-        # A robot that has blown up sees no numbers, so it has no action either. The step is carried
-        # out all the same: whoever looks at its state then finds it out.
+        # A robot whose simulation has blown up observes NaN, so its action is not finite either.
+        # Step all the same, with action 0: whoever checks its state then detects the blow-up.
         actions[~np.isfinite(actions).all(axis=1)] = 0.0
         self._actions[rows] = actions
         self.loco.act(self._actions)

@@ -1,7 +1,7 @@
 """The decision-level MDP (paper Sec. IV-B, IV-C) around a frozen low policy.
 
 ``NavigationTask`` is the MDP for M robots at once, each on a tile of its own whose level the
-curriculum sets; ``NavigationEnv`` is its Gymnasium face for one.
+curriculum sets; ``NavigationEnv`` wraps it as a Gymnasium environment with one robot.
 """
 
 import functools
@@ -38,7 +38,7 @@ from tdgc.tasks.tiles import TrainingTiles, shallow
 
 
 def command_share(commands: Array, decoder: CommandDecoder) -> Array:
-    """Commands (..., 15) as shares of the decoder's ranges, so that differences have one scale."""
+    """Commands (..., 15) as shares of the decoder's ranges, which puts differences on one scale."""
     span = np.where(decoder.high > decoder.low, decoder.high - decoder.low, 1)
     return np.asarray((commands - decoder.low) / span)
 
@@ -52,15 +52,16 @@ def high_step(
     force: Array,
     config: HighRewardConfig,
 ) -> rewards.HighStep:
-    """What the reward terms look at, after a decision was carried out.
+    """The inputs of the reward terms, after a decision has been carried out.
 
     Args:
         loco: the robots.
         goal: (M, 2) m in the world.
-        time_share: (M,) or one for all, t / T_max.
+        time_share: t / T_max, (M,) or a single value for all robots.
         actions: (2, M, 13) of this decision and the one before, normalised.
         shares: (3, M, 15) ``command_share`` of this decision and the two before.
-        force: (M, 5) N, largest since the decision: the trunk, and each leg above the foot.
+        force: (M, 5) N, largest contact forces since the decision: on the trunk, and on each leg
+            above the foot.
         config: weights and constants.
     """
     state = loco.world.state
@@ -83,25 +84,25 @@ def high_step(
 
 
 class NavigationTask:
-    """The high policy's MDP of M robots.
+    """The high policy's MDP for M robots.
 
-    An action is (M, 13) in [-a_max, a_max]; it is decoded and held for ``decimation`` control
-    steps of the frozen low policy. An episode fails when the trunk is low, hits something hard, or
-    the robot leaves its tile; it is truncated after 20 s, or 2 s after the goal was reached.
+    Actions are (M, 13) in [-a_max, a_max]; they are decoded and held for ``decimation`` control
+    steps of the frozen low policy. An episode fails when the trunk is too low or hits something too
+    hard, or when the robot leaves its tile. It is truncated after 20 s, or 2 s after the goal was
+    reached.
 
     Args:
         config: the MDP's configuration.
-        low: the low policy, or its path; a task that is made on another machine needs the
-            policy itself.
+        low: the low policy, or its path; a task built on another machine needs the policy itself.
         num_robots: M.
-        seed: of everything random here.
-        training: draw disturbances and let the curriculum move levels.
-        visual: keep what pictures of the ground need.
-        taught: a teacher's guidance follows the observation, see ``tdgc.learn.imitation``: its
+        seed: seed of everything random in the task.
+        training: draw disturbances and let the curriculum change levels.
+        visual: keep what rendering needs.
+        taught: append a teacher's guidance to the observation, see ``tdgc.learn.imitation``: its
             actions, a second way around pillars, and the prices of strides.
-        led: decisions of each robot over which the share of the episodes that the teacher drives
+        led: number of decisions per robot over which the share of episodes that the teacher drives
             falls from all to none.
-        landing: of the low policy, for the teacher.
+        landing: where the low policy's feet land in leaps, for the teacher.
     """
 
     def __init__(
@@ -142,7 +143,7 @@ class NavigationTask:
         self.goal = np.zeros((m, 2))
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._reached_at = np.full(m, -1)
-        self._untold = np.zeros(m, dtype=bool)  # of the family, in this episode
+        self._untold = np.zeros(m, dtype=bool)  # not told its family in this episode
         self._next_push = np.zeros(m)
         disturbed = config.randomisation, self.rng, self.step_seconds
         self._pushes = Pushes(*disturbed, self._next_push)
@@ -200,11 +201,11 @@ class NavigationTask:
             self._led[index] = rng.uniform(size=n) < share
 
     def _width(self) -> Array:
-        """How wide each robot's disturbances are: they grow with its level."""
+        """Scale of each robot's disturbances, (M,), growing with its level from 0 to 1."""
         return self.curriculum.levels / max(self.config.levels - 1, 1)
 
     def restart(self) -> None:
-        """End every episode, draw new tiles and rebuild the world (see ``LowLevelTask``)."""
+        """End every episode, draw new tiles and rebuild the world from scratch."""
         self.locomotion.world.close()
         self._build_robots()
         self.reset(np.arange(self.num_robots))
@@ -212,13 +213,13 @@ class NavigationTask:
     def step(
         self, actions: NDArray[np.floating]
     ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-        """One decision: (M, 13) -> reward, terminated, truncated, (M,) each.
+        """Carry out one decision: (M, 13) -> reward, terminated, truncated, (M,) each.
 
-        The order is the paper's: physics and low policy, terminations and reaching, reward; the
-        caller resets afterwards.
+        The order is the paper's: physics and low policy, terminations and goal, reward. The caller
+        resets robots afterwards.
 
         Raises:
-            ValueError: a value that is not finite.
+            ValueError: an action that is not finite.
         """
         loco, c = self.locomotion, self.config
         actions = np.where(self._led[:, None], self._taught, actions)
@@ -261,14 +262,14 @@ class NavigationTask:
         done = np.flatnonzero(failed | truncated)
         self._count(terms, reward, commands, done, reached)
         if self.training:
-            own = done[~self._led[done]]  # the teacher's episodes say nothing of the policy
+            own = done[~self._led[done]]  # episodes that the teacher drives do not rate the policy
             if own.size and c.curriculum == "performance":
                 self.curriculum.push(own, reached[own])
             self._pushes.push(loco.world, self.elapsed, self._width())
         return reward, failed, truncated
 
     def observe(self) -> NDArray[np.float32]:
-        """o^H, (M, n), and with a teacher its guidance, (M, ``GUIDANCE``)."""
+        """o^H, (M, n), followed by the guidance, (M, ``GUIDANCE``), if there is a teacher."""
         seen = observe(
             high_layout(self.config),
             Seen(
@@ -287,7 +288,7 @@ class NavigationTask:
         return np.concatenate([seen, self._guidance(self.teacher)], axis=1, dtype=np.float32)
 
     def _guidance(self, teacher: Teacher) -> Array:
-        """What the teacher says, (M, ``GUIDANCE``), in the order of ``GUIDANCE_PARTS``."""
+        """The teacher's guidance, (M, ``GUIDANCE``), in the order of ``GUIDANCE_PARTS``."""
         commands = teacher.commands(self.locomotion, self.goal)
         self._taught, other = (
             self.decoder.encode(self.decoder.nearest(way)) for way in (commands, teacher.other)
@@ -303,7 +304,7 @@ class NavigationTask:
 
     @property
     def family_index(self) -> NDArray[np.int64]:
-        """Index into ``SEMANTIC`` of the family that each robot is told, (M,)."""
+        """Index into ``SEMANTIC`` of the family that each robot observes, (M,)."""
         unknown = SEMANTIC.index("unknown")
         told = np.array([SEMANTIC.index(n) if n in SEMANTIC else unknown for n in self._families])
         return np.where(self._untold, unknown, told)
@@ -332,17 +333,17 @@ class NavigationTask:
                 add(f"family/{family}/{name}", (gait[mine] == g).sum())
 
     def take_stats(self) -> dict[str, float]:
-        """The sums since the last call."""
+        """Return and restart the sums; Bullet's time is a running total."""
         stats, self.stats = self.stats, Sums()
         stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
         return stats
 
     def forget(self) -> None:
-        """Let what follows depend on ``state_dict`` alone, see ``World.forget``."""
+        """Make what follows depend on ``state_dict`` alone, see ``World.forget``."""
         self.locomotion.world.forget()
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """Of the episodes under way."""
+        """State of the episodes under way, not copied."""
         taught = {} if self.teacher is None else {"speed": self.teacher.speed}
         return taught | {
             "goal": self.goal,
@@ -361,7 +362,7 @@ class NavigationTask:
         }
 
     def state_dict(self) -> State:
-        """The curriculum and the robots' ``episodes`` under way, as copies."""
+        """The curriculum, the random generator and the ``episodes`` under way, as copies."""
         return {
             "rng": self.rng.bit_generator.state,
             "tiles_drawn": self.tiles.drawn,
@@ -375,11 +376,13 @@ class NavigationTask:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Go on from a ``state_dict``, as a ``forget`` there would have gone on; from one without
-        ``episodes`` with new ones, from one without a ``curriculum`` with the levels there are.
+        """Resume from a ``state_dict``, exactly as the saved task continues after ``forget``.
+
+        Without ``episodes`` in the state, new ones begin; without a ``curriculum``, the current
+        levels stay.
 
         Raises:
-            ValueError: a state of other robots.
+            ValueError: the state does not fit these robots.
         """
         self.rng.bit_generator.state = state["rng"]
         if "curriculum" in state:
@@ -404,15 +407,15 @@ class NavigationTask:
 
 
 class NavigationEnv(TaskEnv):
-    """``NavigationTask`` for one robot, id ``tdgc/Navigation-v0``.
+    """``NavigationTask`` with one robot, id ``tdgc/Navigation-v0``.
 
-    Observations are those of ``high_layout``, (92,) by default; actions are (13,) in [-1, 1]: the
-    continuous commands in the order of ``tdgc.sim.commands.CONTINUOUS``, then the gait. A step is a
-    decision, 0.1 s.
+    Observations are those of ``high_layout``, (92,) by default. Actions are (13,) in [-1, 1]: the
+    continuous commands in the order of ``tdgc.sim.commands.CONTINUOUS``, then the gait. A step is
+    one decision, 0.1 s.
 
     Args:
-        config: the MDP; the default one if None.
-        low: the frozen low policy's file.
+        config: the MDP's configuration; the default one if None.
+        low: file of the frozen low policy.
         render_mode: None or rgb_array.
 
     Raises:

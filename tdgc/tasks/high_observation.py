@@ -1,5 +1,5 @@
-"""What the high policy sees, o^H (paper Sec. IV-B): a table of terms, from which sizes and mirrors
-follow."""
+"""The high policy's observation o^H (paper Sec. IV-B): a table of terms, which also gives its size
+and its mirror image."""
 
 from typing import Any, NamedTuple
 
@@ -18,9 +18,10 @@ from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP
 from tdgc.tasks.teacher import WAY
 
-GOAL_SCALE = 1.0 / 8.0  # 1/m: distances as shares of the tile's length
-#: What a teacher adds to an observation, and how wide it is: its actions; how the second way around
-#: differs in those of ``WAY``, and its price; the prices of strides.
+GOAL_SCALE = 1.0 / 8.0  # 1/m: scales distances to shares of the tile's length
+#: What a teacher appends to an observation, and the width of each part: its actions; how the second
+#: way around an obstacle differs in the actions ``WAY``, and how much longer it is; the prices of
+#: strides.
 GUIDANCE_PARTS = {
     "taught": NUM_ACTIONS,
     "aside": len(WAY),
@@ -29,22 +30,22 @@ GUIDANCE_PARTS = {
 }
 GUIDANCE = sum(GUIDANCE_PARTS.values())
 
-#: The semantic cue: one-hot over the families, and one place for "unknown".
+#: The semantic cue: one-hot over the families and "unknown".
 SEMANTIC = (*FAMILIES, "unknown")
 
 
 class Seen(NamedTuple):
-    """What o^H of M robots is read from.
+    """The sources of o^H for M robots.
 
     Attributes:
         loco: the robots.
         goal: (M, 2) m in the world.
         time_share: (M,) t / T_max.
         last_action: (M, 13), normalised.
-        families: (M,) index into ``SEMANTIC``.
-        probes: (M, 32) m, as ``HeightProbes.read`` or ``height_probes`` gives them.
-        late: (M,) how many decisions ago those were measured.
-        closing: (M,) m/s, how fast the goal came nearer since the last decision.
+        families: (M,) indices into ``SEMANTIC``.
+        probes: (M, 32) m, from ``HeightProbes.read`` or ``height_probes``.
+        late: (M,) how many decisions ago the probes were measured.
+        closing: (M,) m/s, speed towards the goal since the last decision.
     """
 
     loco: Locomotion
@@ -99,7 +100,7 @@ def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
 
 
 def untold_column(config: HighLevelConfig) -> int | None:
-    """Where o^H is 1 if the family is unknown; None without the semantic cue."""
+    """Column of o^H that is 1 if the family is unknown; None without the semantic cue."""
     family = columns(high_layout(config)).get("family")
     return None if family is None else family.start + SEMANTIC.index("unknown")
 
@@ -107,7 +108,7 @@ def untold_column(config: HighLevelConfig) -> int | None:
 def high_spaces(
     config: HighLevelConfig, taught: bool = False
 ) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """Observations, with the teacher's guidance if there is one, and actions of the high policy."""
+    """Observation space, with a teacher's guidance if ``taught``, and action space."""
     size = width(high_layout(config)) + taught * GUIDANCE
     limit = config.action_limit
     seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
@@ -118,7 +119,7 @@ def high_mirror(config: HighLevelConfig) -> Mirror:
     """Left-right mirror of the high policy's observations and actions.
 
     Raises:
-        ConfigError: probes or bounds to one side that are not those to the other.
+        ConfigError: probes or command bounds that are not left-right symmetric.
     """
     if config.probes == "staggered":
         raise ConfigError(

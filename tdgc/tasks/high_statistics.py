@@ -1,4 +1,4 @@
-"""The log's values of the high policy's training, made of sums over its decisions."""
+"""Logged values of the high policy's training, from sums over its decisions."""
 
 from collections.abc import Mapping
 
@@ -7,7 +7,7 @@ from tdgc.tasks.statistics import mean_rewards
 
 
 def summarise(sums: Mapping[str, float]) -> dict[str, float]:
-    """Sums of ``NavigationTask.take_stats`` over all workers -> values to log."""
+    """Turn ``NavigationTask.take_stats``, summed over all workers, into values to log."""
     values = mean_rewards(sums)
     counts = [k for k in sums if k.startswith("family/") and k.endswith("/count")]
     families = [k.removeprefix("family/").removesuffix("/count") for k in counts]

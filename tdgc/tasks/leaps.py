@@ -1,11 +1,11 @@
-"""Leaps over trenches: pronk whose landings are planned to miss them.
+"""Leaps over trenches: pronk with landings planned to miss them.
 
-In pronk the front feet land on one line and the rear feet on another, and a robot that steers
-straight on decides where by its speed, its step frequency and its stance length. So a trench is
-crossed by a plan of landings: a value function over the place of the front feet, found by dynamic
-programming over the strides to come, says what each place is worth, and frequency and stance length
-are chosen for the best place within reach. Feet land about where Raibert's rule has them; by how
-much a low policy misses that is its own, to a few centimetres, so it is measured.
+In pronk the front feet land on one line and the rear feet on another. For a robot that steers
+straight ahead, its speed, step frequency and stance length decide where these lines are. A trench
+is therefore crossed by a plan of landings: dynamic programming over the coming strides yields a
+value function over the position of the front feet, and frequency and stance length are chosen for
+the best position within reach. Feet land close to Raibert's footholds; how far off differs between
+low policies by a few centimetres, so it is measured.
 """
 
 from dataclasses import dataclass
@@ -21,53 +21,57 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TILE_SIZE
 
-if TYPE_CHECKING:  # the low policy's workers do without PyTorch
+if TYPE_CHECKING:  # the low policy's workers do not load PyTorch
     from tdgc.policies import Policy
 
-#: How leaps are made: m/s, m of swing, duty factor. The faster, the longer a stride and the wider
-#: the trenches that fit in: of 24 robots 5, 10 and 17 crossed level 10 at 1.0, 1.1 and 1.2 m/s. Of
-#: feet at 5 cm a quarter fell in. At the 2 Hz of a start from rest robots were thrown down, so a
-#: stride of a slow one is priced as if it had this speed already (docs/experiments.md).
+#: Commands of a leap: speed in m/s, swing height in m, duty factor. Faster leaps have longer
+#: strides, into which wider trenches fit: of 24 robots 5, 10 and 17 crossed level 10 at 1.0, 1.1
+#: and 1.2 m/s. With a swing height of 5 cm a quarter fell in. All leaps at 2 Hz from rest ended in
+#: a fall, so a slow robot's stride is priced as if it already had this speed (docs/experiments.md).
 SPEED, SWING_HEIGHT, DURATION = 1.2, 0.07, 0.55
-STRIDE = 0.39  # m, of leaps where nothing asks for another: longer ones trip at the start
-#: m, of leaps altogether, as commanded. A policy that was trained on strides of 0.6 m learned to
-#: nod in them, and then in shorter ones too; one that was trained up to 0.5 m did not. Where
-#: landings are 1 cm off, 29 of 30 tiles of level 10 can be crossed so, and 20 with 0.45 m.
+STRIDE = 0.39  # m, preferred stride of a leap: with longer ones robots trip at the start
+#: m, longest commanded stride in pronk. A policy trained on strides of 0.6 m learned to nod in
+#: them, and then in shorter ones too; one trained on strides up to 0.5 m did not. With landings
+#: 1 cm off, 29 of 30 tiles of level 10 can be crossed with this limit, and 20 with 0.45 m.
 LONGEST = 0.48
-BEYOND = 0.5  # m behind the last trench, where leaping ends
-_TURN = 1.5  # 1/s, yaw rate per rad that a leap is off its heading; as in ``teacher.toward``
-_STEP = 0.01  # m between the places of a plan
-_STRIDES = np.arange(28, 47, 2)  # steps: what 0.95 SPEED reaches between 2.5 and 4 Hz
-#: m from a lip, at which a foot is as good as anywhere. Of 40 robots that were told where trenches
-#: are 3, 15 and 28 crossed level 10 with 0.12, 0.08 and 0.05 m.
+BEYOND = 0.5  # m behind the last trench, at which leaping ends
+_TURN = 1.5  # 1/s, yaw rate per rad of heading error in a leap; as in ``teacher.toward``
+_STEP = 0.01  # m, grid spacing of a plan
+_STRIDES = np.arange(28, 47, 2)  # in units of _STEP: strides at 0.95 SPEED and 2.5 to 4 Hz
+#: m from a trench's edge (its lip), beyond which a foot is safe. Of 40 robots that were told where
+#: the trenches are, 3, 15 and 28 crossed level 10 with 0.12, 0.08 and 0.05 m.
 CLEAR = 0.05
-_FALL = 4.0  # price of a foot in a trench; one that lands on the lip costs 1
-_STRIDE_PRICE = 10.0  # 1/m^2, of a stride that is not STRIDE
-_LENGTH_PRICE = 2.0  # 1/m^2, of rear feet that do not land where the front feet stood
-# A stride is decided until this share of its cycle: after that the legs push off, and a clock that
-# changes while they do, or in the air, throws the trunk off balance. Changes from stride to stride
-# do, too, hence their price in 1/Hz^2. Of 24 tiles of level 6 and of level 10 a teacher crossed 12
-# and 4 without both, 23 and 5 with the first alone, and 24 and 11 with both (docs/experiments.md).
+_FALL = 4.0  # price of a foot in a trench; a foot on the lip costs 1
+_STRIDE_PRICE = 10.0  # 1/m^2, for the squared difference of a stride from STRIDE
+_LENGTH_PRICE = 2.0  # 1/m^2, for the squared distance of rear feet from where the front stood
+# A stride can be changed until this share of its cycle. After that the legs push off, and a change
+# of the clock during push-off or flight throws the trunk off balance. So do changes from stride to
+# stride, hence their price in 1/Hz^2. Of 24 tiles each of levels 6 and 10, a teacher crossed 12 and
+# 4 with neither rule, 23 and 5 with the first alone (21 and 8 with 0.5 of the cycle), and 24 and 11
+# with both at 0.5 of the cycle (docs/experiments.md).
 _DECIDED, _CHANGE_PRICE = 0.4, 0.5
-FREQUENCIES, LENGTHS = 25, 11  # tried at each decision, evenly over the ranges of the commands
-# How robots speed up, of two low policies: 0.8, 1.1 and 1.2 m/s at the first landings after a rest,
-# and 1.14 m/s for 1.2 in the long run. Without it a trench right behind the start was misjudged by
-# 7 cm.
-_RISE, _REACHED = 0.3, 0.95  # s of the exponential; share of the commanded speed at its end
-# What is about as good as the best choice: the price by which others count e times less, and how
-# many Hz and m they may be away, so that leaping short is never mixed with leaping far.
+FREQUENCIES, LENGTHS = 25, 11  # how many are tried at each decision, evenly over the command ranges
+# How leaping robots speed up, from two low policies: 0.8, 1.1 and 1.2 m/s at the first landings
+# from rest, and 1.14 m/s in the long run when 1.2 is commanded. Without this model, landings at a
+# trench right behind the start were misjudged by 7 cm.
+_RISE, _REACHED = 0.3, 0.95  # time constant in s; share of the commanded speed that is reached
+# Choices about as good as the best are averaged: the price that reduces a choice's weight by a
+# factor of e, and how many Hz and m it may be from the best, so that a short leap is never averaged
+# with a long one.
 _TEMPERATURE, _NEAR = 0.05, (0.35, 0.03)
 
 
 def lead(speed: Array, frequency: Array) -> Array:
-    """How far ahead of their places at rest feet touch down, m: half of what the trunk travels in a
+    """How far ahead of their rest positions feet touch down, in m: half of the trunk's travel in a
     stance (Raibert), at ``speed`` in m/s and ``frequency`` in Hz."""
     return 0.5 * DURATION * speed / frequency
 
 
 def speed_up(speed: Array, commanded: Array | float, time: Array | float) -> tuple[Array, Array]:
-    """How far a trunk gets in ``time`` s, in m, and how fast it is then, in m/s: from ``speed``
-    towards nearly the ``commanded`` one. It does not slow down."""
+    """Distance in m that a trunk covers in ``time`` s, and its speed in m/s after that.
+
+    The speed rises exponentially from ``speed`` to 0.95 of the ``commanded`` one; it never falls.
+    """
     top = np.maximum(speed, _REACHED * commanded)
     left = np.exp(-time / _RISE)
     return top * time - (top - speed) * _RISE * (1.0 - left), top - (top - speed) * left
@@ -75,31 +79,31 @@ def speed_up(speed: Array, commanded: Array | float, time: Array | float) -> tup
 
 @dataclass
 class Landing:
-    """By how much a low policy's feet miss Raibert's footholds when they land in pronk, in m.
+    """How far a low policy's feet land from Raibert's footholds in pronk, in m.
 
     Attributes:
-        front: its front feet, ahead of their footholds.
-        spread: its rear feet, so much further behind the front ones than commanded.
+        front: how far the front feet land ahead of their footholds.
+        spread: how much further behind the front feet than commanded the rear feet land.
     """
 
-    #: Until something is known.
+    #: Zero until a landing has been seen.
     front: float = 0.0
     spread: float = 0.0
 
     def learn(
         self, loco: Locomotion, rows: NDArray[np.integer], before: Array, rate: float
     ) -> None:
-        """Move towards where the robots ``rows`` (n,) stand, those of them that have just landed.
+        """Update the estimate from those of the robots ``rows`` (n,) that have just landed.
 
         Args:
             loco: robots that leap along x.
-            rows: that are to be looked at.
+            rows: robots to be looked at.
             before: (n,) their clocks a control step ago.
-            rate: share of the way that one landing moves the estimate.
+            rate: weight of one landing in the estimate.
         """
         state = loco.world.state
         clock = loco.clock.clock[rows]
-        middle = 0.2  # of a cycle: all feet are down in the shortest stance, 0.4
+        middle = 0.2  # of a cycle: the middle of the shortest stance, 0.4, when all feet are down
         landed = (before < middle) & (clock >= middle)
         seen = rows[landed]
         if seen.size:
@@ -115,8 +119,10 @@ class Landing:
 
 
 def foothold_risk(x: NDArray[np.floating], trenches: Array, clear: float = CLEAR) -> Array:
-    """Price of a foot at ``x`` (...,) m along trenches (k, 2) m, ``_FALL`` inside them and nothing
-    from ``clear`` m on."""
+    """Price of a foot at ``x`` (...,) m, given the x of the lips of trenches, (k, 2) m.
+
+    It is ``_FALL`` inside a trench; outside it falls from 1 at the lip to 0 at ``clear`` m from it.
+    """
     if not len(trenches):
         return np.zeros_like(x)
     inside = np.minimum(x[..., None] - trenches[:, 0], trenches[:, 1] - x[..., None]).max(axis=-1)
@@ -125,13 +131,13 @@ def foothold_risk(x: NDArray[np.floating], trenches: Array, clear: float = CLEAR
 
 
 class Motion(NamedTuple):
-    """Of n robots that leap, (n,) each.
+    """State of n robots that leap, (n,) each.
 
     Attributes:
-        x: m, of the trunk along the trenches.
-        speed, commanded: m/s forward.
-        clock: of the gait, 0 where feet touch down.
-        frequency, length: Hz and m, of steps and stance, as commanded until now.
+        x: m, position of the trunk on the axis that the lips of the trenches are given on.
+        speed, commanded: m/s, forward speed and its command.
+        clock: gait clock, 0 when the feet touch down.
+        frequency, length: step frequency in Hz and stance length in m, as last commanded.
     """
 
     x: Array
@@ -143,16 +149,17 @@ class Motion(NamedTuple):
 
 
 class Lesson(NamedTuple):
-    """How n robots should make their next stride, to be imitated.
+    """How n robots should make their next stride, for a student to imitate.
 
-    Of the choices about as good as the best one jumps about, for no reason that a student could
-    see, so these are their means. But between two ways of crossing a trench lies its middle, and
-    who is in doubt between them and takes a mean steps there; so it is told the prices, too.
+    Among choices that are about equally good, the best one jumps for no reason that a student could
+    observe, so ``frequency`` and ``length`` are means over such choices. But a student that is
+    unsure between two ways of crossing a trench and takes their mean steps into the trench, so it
+    also gets the prices.
 
     Attributes:
-        frequency, length: (n,) Hz and m, of steps and stance.
-        price: (n, FREQUENCIES, LENGTHS) what each choice costs more than the best one does; 0 for
-            robots that have decided already.
+        frequency, length: (n,) step frequency in Hz and stance length in m.
+        price: (n, FREQUENCIES, LENGTHS) how much more each choice costs than the best one; 0 for
+            robots whose stride can no longer be changed.
     """
 
     frequency: Array
@@ -161,12 +168,12 @@ class Lesson(NamedTuple):
 
 
 class LeapPlan:
-    """What landings are worth, for M robots that each leap along trenches of their own.
+    """Costs of landings for M robots, each of which leaps over trenches of its own.
 
     Args:
         num_robots: M.
-        ranges: of the commands that leaps are made with.
-        clear: m from a lip, at which a foot is as good as anywhere.
+        ranges: command ranges of the leaps.
+        clear: m from a lip, beyond which a foot is safe.
     """
 
     def __init__(self, num_robots: int, ranges: CommandRanges, clear: float = CLEAR) -> None:
@@ -176,11 +183,12 @@ class LeapPlan:
         self._lengths = np.linspace(low, high, LENGTHS)
         self._frequencies = np.linspace(*ranges.frequency, FREQUENCIES)
         self._x = _STEP * np.arange(1 + round(TILE_SIZE / _STEP))
-        # Price of front feet at each place, with each stance length, and of all that follows.
+        # Cost of landing with the front feet at each position and with each stance length, and of
+        # all later strides.
         self._cost = np.zeros((num_robots, len(self._x), len(self._lengths)))
 
     def look(self, robot: int, trenches: ArrayLike, spread: float) -> None:
-        """Plan for one robot along ``trenches`` (k, 2) m, the x of their lips, in its own frame."""
+        """Plan for one robot; ``trenches`` (k, 2) m are the x of their lips in its tile's frame."""
         lips = np.asarray(trenches, dtype=np.float64).reshape(-1, 2)
         x, n = self._x, len(self._x)
         price = foothold_risk(x[:, None] - self._lengths - spread, lips, self._clear)
@@ -189,7 +197,7 @@ class LeapPlan:
         value = np.zeros(n + _STRIDES[-1])
         after = np.concatenate([price.min(axis=1), np.zeros(_STRIDES[-1])])
         dear = _STRIDE_PRICE * (_STEP * _STRIDES - STRIDE) ** 2
-        end = lips[-1, 1] + STRIDE if len(lips) else 0.0  # nothing is worth planning behind it
+        end = lips[-1, 1] + STRIDE if len(lips) else 0.0  # behind it no plan is needed
         for k in range(min(n, round(end / _STEP)) - 1, -1, -1):
             ahead = k + _STRIDES
             value[k] = np.min(dear + after[ahead] + value[ahead])
@@ -201,15 +209,15 @@ class LeapPlan:
         """Step frequency in Hz and stance length in m for the next landing, (n,) each.
 
         Args:
-            rows: (n,) of the M robots.
-            motion: theirs.
-            landing: the low policy's.
+            rows: (n,) indices of the robots.
+            motion: their state.
+            landing: that of the low policy.
         """
         frequency, length = self._best(self._costs(rows, motion, landing))
         return self._held(motion, self._frequencies[frequency], self._lengths[length])
 
     def lesson(self, rows: NDArray[np.integer], motion: Motion, landing: Landing) -> "Lesson":
-        """As ``steps``, for who is to be imitated, and what other choices would cost."""
+        """Like ``steps``, but for imitation: means of good choices, and the prices of all."""
         cost = self._costs(rows, motion, landing)
         frequency, length = self._best(cost)
         off = np.abs(self._frequencies - self._frequencies[frequency][:, None])
@@ -224,7 +232,7 @@ class LeapPlan:
         return Lesson(*self._held(motion, *means), price)
 
     def _held(self, motion: Motion, frequency: Array, length: Array) -> tuple[Array, Array]:
-        """Frequencies and lengths (n,); those of now for robots that are about to take off."""
+        """Frequencies and lengths (n,); robots past ``_DECIDED`` of their cycle keep their own."""
         late = motion.clock >= _DECIDED
         return (
             np.where(late, np.clip(motion.frequency, *self._frequencies[[0, -1]]), frequency),
@@ -237,7 +245,7 @@ class LeapPlan:
         return frequency, length
 
     def _costs(self, rows: NDArray[np.integer], motion: Motion, landing: Landing) -> Array:
-        """Of each frequency and stance length, (n, frequencies, lengths)."""
+        """Cost of each frequency with each stance length, (n, frequencies, lengths)."""
         stride = np.maximum(motion.speed, self._speed)[:, None] / self._frequencies
         left = (1.0 - motion.clock)[:, None] / self._frequencies
         own = np.maximum(motion.speed, 0.0)[:, None]
@@ -253,7 +261,8 @@ class LeapPlan:
 
 
 def leap_command(command: Array, frequency: ArrayLike, length: ArrayLike) -> None:
-    """Turn commands (n, 15) into those of a leap, in place: gait, swing, frequency, length."""
+    """Turn commands (n, 15) into leaps, in place: gait, swing height, duty factor, frequency and
+    stance length."""
     command[:, INDEX["swing_height"]] = SWING_HEIGHT
     command[:, INDEX["duration"]] = DURATION
     command[:, INDEX["frequency"]] = frequency
@@ -264,13 +273,13 @@ def leap_command(command: Array, frequency: ArrayLike, length: ArrayLike) -> Non
 def steer_leap(command: Array, bearing: Array, heading: Array, ranges: CommandRanges) -> None:
     """Set the velocities of commands (n, 15) of leaps, in place.
 
-    The robots face across the trenches, so that both feet of a pair land on one line, and go
-    sideways to the goal.
+    The robots face straight across the trenches, so that both feet of a pair land on one line, and
+    move sideways as needed to reach the goal.
 
     Args:
-        command: to be changed.
-        bearing, heading: (n,) rad of the goal and of the robots, against across the trenches.
-        ranges: that they stay within.
+        command: changed in place.
+        bearing, heading: (n,) rad, of the goal and the robots, from straight across the trenches.
+        ranges: bounds of the velocities.
     """
     wanted = (
         ("vx", SPEED * np.cos(bearing)), ("vy", SPEED * np.sin(bearing)),
@@ -280,20 +289,21 @@ def steer_leap(command: Array, bearing: Array, heading: Array, ranges: CommandRa
         command[:, INDEX[name]] = np.clip(value, *getattr(ranges, name))
 
 
-_ROBOTS = 16  # that a landing is measured with: a few millimetres between two such measurements
-_SECONDS, _SETTLE = 6.0, 1.5  # s, of the measurement, and how much of it speeding up takes
-_STANDING = 0.5  # share of the robots that are still up after the measurement, where leaps work
-_RATE = 0.02  # of a landing in the measurement: after 180 of them 3 % of the start is left
+_ROBOTS = 16  # number of robots in a measurement, which repeats to a few millimetres
+_SECONDS, _SETTLE = 6.0, 1.5  # s, duration of the measurement, and of speeding up within it
+_STANDING = 0.5  # least share of robots still up after the measurement if the policy can leap
+_RATE = 0.02  # weight of a landing: after 180 of them 3 % of the initial estimate is left
 
 
 def measure_landing(low: "Policy", config: LowLevelConfig) -> Landing | None:
-    """Where ``low`` lands when it leaps along a plane, with strides of 0.32 m to ``LONGEST``.
+    """Measure where ``low`` lands when it leaps on a plane, with strides of 0.32 m to ``LONGEST``.
 
     Args:
-        low: the low policy, of ``config``.
+        low: the low policy.
+        config: its configuration.
 
     Returns:
-        The landing; None for a policy that cannot leap: most robots have fallen.
+        The landing; None for a policy that cannot leap, with most robots fallen.
     """
     loco = Locomotion(_ROBOTS, config.robot, config.physics, None, config.gyro)
     rows, dt = np.arange(_ROBOTS), config.physics.control_dt

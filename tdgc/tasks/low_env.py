@@ -1,6 +1,7 @@
-"""The low policy's MDP (paper Sec. IV-A): follow commands, in gait, on rising terrain.
+"""The low policy's MDP (paper Sec. IV-A): follow commands in gait, on increasingly hard terrain.
 
-``LowLevelTask`` is the MDP for M robots at once; ``LowLevelEnv`` is its Gymnasium face for one.
+``LowLevelTask`` is the MDP for M robots at once; ``LowLevelEnv`` wraps it as a Gymnasium
+environment with one robot.
 """
 
 import functools
@@ -39,26 +40,27 @@ _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap
 
 
 class LowLevelTask:
-    """The low policy's MDP, M robots at once.
+    """The low policy's MDP for M robots.
 
     Observation rows are [actor part | critic part], see ``tdgc.tasks.low_observation``. Actions are
-    (M, 12) in [-a_max, a_max]. An episode ends in failure when the trunk is lower than 0.15 m above
-    the support surface or hits something with more than 40 N, and is truncated after 20 s, where
-    the robot leaves its tile, or when it has crossed it.
+    (M, 12) in [-a_max, a_max]. An episode ends in failure when the trunk is less than 0.15 m above
+    the support surface or hits something with more than 40 N. It is truncated after 20 s, when the
+    robot leaves its tile, or when it has crossed it.
 
     Args:
         config: the MDP's configuration.
         num_robots: M.
-        seed: of everything random here.
-        training: draw noise, pushes and randomised dynamics.
-        visual: keep what pictures of the ground need.
+        seed: seed of everything random in the task.
+        training: draw noise, pushes and randomised dynamics, and let levels and command ranges
+            change.
+        visual: keep what rendering needs.
 
     Attributes:
-        level: (M,) of each robot's tile.
-        commands: what draws commands, from velocity ranges that grow.
-        crossings: what leads robots over their tiles.
-        episodes: what the robots carry from step to step.
-        ground: under them after the last step or reset.
+        level: (M,) level of each robot's tile.
+        commands: draws commands, from velocity ranges that grow.
+        crossings: steers robots over their tiles.
+        episodes: per-robot state that persists from step to step.
+        ground: the ground under the robots after the last step or reset.
     """
 
     def __init__(
@@ -82,7 +84,7 @@ class LowLevelTask:
         alter = functools.partial(shallow, shallowest=config.crossing.shallowest_trench)
         self.tiles = TrainingTiles(families, seed, alter) if on_tiles else None
         self.field = None if self.tiles is None else self.tiles.field
-        # The control steps of the slowest gait's cycle, and one between which and the next it ends.
+        # Longest gait cycle in control steps; tilts are kept for one step more, to interpolate.
         cycle = 1.0 / (config.commands.frequency[0] * config.physics.control_dt)
         self.episodes = Episodes(m, math.ceil(cycle) + 1)
         self.commands = CommandDraw(config, self.rng, training)
@@ -117,14 +119,14 @@ class LowLevelTask:
             self.locomotion.randomise(index, self.config.randomisation, self.rng)
             self.pushes.schedule(index, self.episodes.elapsed)
         self._draw_commands(index)
-        # Face so that the first command needs no turn on the spot.
+        # Start at the commanded heading, so that the first command needs no turn on the spot.
         yaw = yaw + np.where(self.episodes.crossing[index], self.episodes.facing[index], 0.0)
         self.locomotion.place(index, xy, yaw, self.rng.uniform(size=len(index)))
         self.ground = measure_ground(self.locomotion)
         self.crossings.steer(self.locomotion, self.ground)
 
     def _draw_places(self, index: NDArray[np.integer]) -> tuple[Array, Array]:
-        """Where the robots ``index`` (n,) start, (n, 2) m, and their yaw, (n,) rad."""
+        """Draw where the robots ``index`` (n,) start, (n, 2) m, and their yaw, (n,) rad."""
         n, rng = len(index), self.rng
         if self.tiles is None:
             xy = np.stack([index % 10, index // 10], axis=1) * _PLANE_SPACING
@@ -135,13 +137,13 @@ class LowLevelTask:
             self.crossings.look(self.tiles.field, changed)
         origin = self.tiles.field.origin(index, np.zeros_like(index))
         start, goal = draw_start_goal(rng, (n,))
-        # Free commands lead anywhere, so those robots of a flat tile start in its middle.
+        # Free commands lead anywhere, so robots on flat tiles start in the middle.
         start[self.crossings.flat[index], :2] = 0.5 * TILE_SIZE
         self.crossings.begin(index, origin, goal + origin)
         return start[:, :2] + origin, start[:, 2]
 
     def _draw_commands(self, index: NDArray[np.integer]) -> None:
-        """New commands for the robots ``index`` (n,), free or to cross their tiles with."""
+        """Draw new commands for the robots ``index`` (n,), free or for crossing their tiles."""
         bounds = self.commands.bounds(len(index))
         self.crossings.narrow(index, self.level, *bounds)
         free = ~self.episodes.crossing[index]
@@ -152,21 +154,21 @@ class LowLevelTask:
         self.locomotion.command[index] = command
 
     def restart(self) -> None:
-        """End every episode, redraw the terrain and build the world from scratch, as a run
-        begins."""
+        """End every episode, redraw the terrain and rebuild the world from scratch, as at the start
+        of a run."""
         self.locomotion.world.close()
         self._build()
         self.commands.scores[:] = 0.0
         everyone, e = np.arange(self.num_robots), self.episodes
         self.reset(everyone)
-        # Spread the ends of the coming episodes over time.
+        # Spread the ends of the new episodes over time.
         e.elapsed[:] = e.began[:] = self.rng.integers(0, self.horizon, self.num_robots)
         self.pushes.schedule(everyone, e.elapsed)
 
     def step(
         self, actions: NDArray[np.floating]
     ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-        """One control step of all robots: (M, 12) -> reward, terminated, truncated, (M,) each."""
+        """Run one control step: (M, 12) -> reward, terminated, truncated, (M,) each."""
         loco, c, e = self.locomotion, self.config, self.episodes
         speed, clock = loco.world.state.qd.copy(), loco.clock.clock.copy()
         loco.act(np.asarray(actions, dtype=np.float64))
@@ -182,7 +184,8 @@ class LowLevelTask:
         e.tilts[:, 0] = loco.world.state.gravity[:, :2]
         e.was_contact[:] = loco.world.state.foot_force > rewards.CONTACT_FORCE
         if self.training:
-            # Once each: tried again until they succeed, a few hopeless ones would be all there is.
+            # A failed retry is not remembered again: retried until they succeed, a few hopeless
+            # commands would soon be the only ones left.
             self.commands.remember(loco.command[terminated & ~e.crossing & ~e.retried])
             self._move_levels(terminated, terminated | truncated)
         self._change_commands()
@@ -191,7 +194,7 @@ class LowLevelTask:
         return reward, terminated, truncated
 
     def _change_commands(self) -> None:
-        """Draw those that are due, and steer crossings."""
+        """Draw the commands that are due, and steer crossings."""
         if self._command_steps:
             elapsed = self.episodes.elapsed
             due = np.flatnonzero((elapsed % self._command_steps == 0) & (elapsed > 0))
@@ -240,24 +243,24 @@ class LowLevelTask:
         )
 
     def _last_tilt(self, frequency: Array) -> Array:
-        """Tilt a cycle of ``frequency`` (M,) Hz ago, (M, 2), between the steps next to it."""
+        """Tilt one cycle of ``frequency`` (M,) Hz ago, (M, 2), interpolated between steps."""
         tilts = self.episodes.tilts
-        # ``tilts`` begins with the step before this one.
+        # ``tilts`` starts at the previous step.
         ago = 1.0 / (frequency * self.config.physics.control_dt) - 1.0
         newer = np.clip(np.floor(ago).astype(int), 0, tilts.shape[1] - 2)
         rows, older = np.arange(len(tilts)), (ago - newer)[:, None]
         return (1.0 - older) * tilts[rows, newer] + older * tilts[rows, newer + 1]
 
     def _penalty(self) -> Array:
-        """Share of the penalties that counts for each robot, (M,): it falls as the commands of its
-        gait grow, and is least on terrain."""
+        """Share of the penalties that counts for each robot, (M,): ``terrain_penalty`` on terrain;
+        on flat ground from 1 to ``walking_penalty`` as the gait's velocity ranges grow."""
         c = self.config.rewards
         share = 1.0 + (c.walking_penalty - 1.0) * self.commands.grown()
         mine = share[gait_index(self.locomotion.command)]
         return np.where(self.crossings.flat, mine, c.terrain_penalty)
 
     def observe(self) -> NDArray[np.float32]:
-        """(M, n): the actor's part, noisy in training, and the critic's."""
+        """Observations (M, n): the actor's part, noisy in training, then the critic's."""
         actor = self.locomotion.observe(self._noise)
         critic = observe(CRITIC_LAYOUT, Seen(self.locomotion, self.ground))
         return np.concatenate([actor, critic], axis=1)
@@ -265,7 +268,7 @@ class LowLevelTask:
     # ------------------------------------------------------------------ statistics, resume
 
     def _count(self, terms: dict[str, Array], reward: Array, terminated: NDArray[np.bool_]) -> None:
-        """Add this step to ``stats`` (``tdgc.learn.run`` divides and logs them)."""
+        """Add this step to ``stats``; see ``low_statistics.summarise`` for what is logged."""
         add = self.stats.add
         self.stats.add_rewards(terms, reward)
         add("minutes", self.num_robots * self.config.physics.control_dt / 60.0)
@@ -283,7 +286,7 @@ class LowLevelTask:
                     add(f"level/{family}/level", self.level[mine].sum())
 
     def take_stats(self) -> dict[str, float]:
-        """The sums since the last call."""
+        """Return and restart the sums; command shares, landing and Bullet's time are not reset."""
         stats, self.stats = self.stats, Sums()
         for gait, share in zip(GAITS, self.commands.share, strict=True):
             stats[f"share/{gait}"] = self.num_robots * float(share)
@@ -297,7 +300,7 @@ class LowLevelTask:
         return stats
 
     def forget(self) -> None:
-        """Let what follows depend on ``state_dict`` alone, see ``World.forget``."""
+        """Make what follows depend on ``state_dict`` alone, see ``World.forget``."""
         self.locomotion.world.forget()
 
     def _learned(self) -> dict[str, NDArray[Any]]:
@@ -310,7 +313,7 @@ class LowLevelTask:
         return self.episodes.arrays() | own
 
     def state_dict(self) -> State:
-        """What was learned of the robots, and their ``episodes`` under way, as copies."""
+        """Levels, command curriculum, landing, generator and ``episodes`` under way, as copies."""
         landing = self.crossings.landing
         return {
             "rng": self.rng.bit_generator.state,
@@ -325,11 +328,12 @@ class LowLevelTask:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Go on from a ``state_dict``, as a ``forget`` there would have gone on; from one without
-        ``episodes`` with new ones.
+        """Resume from a ``state_dict``, exactly as the saved task continues after ``forget``.
+
+        Without ``episodes`` in the state, new ones begin.
 
         Raises:
-            ValueError: a state of other robots.
+            ValueError: the state does not fit these robots.
         """
         self.rng.bit_generator.state = state["rng"]
         self.crossings.landing = Landing(*state["landing"])
@@ -356,8 +360,8 @@ class LowLevelTask:
 def make_task(
     config: tuple[LowLevelConfig, LowLevelConfig], share: float, robots: int, seed: int
 ) -> Task:
-    """The robots of a worker: a share of them in the first MDP, the others, one at least, in the
-    second."""
+    """Make a worker's task: a ``share`` of its robots in the first MDP; the rest, at least one, in
+    the second."""
     first = min(round(share * robots), robots - 1)
     if not first:
         return LowLevelTask(config[1], robots, seed)
@@ -371,15 +375,15 @@ def make_task(
 
 
 class LowLevelEnv(TaskEnv):
-    """``LowLevelTask`` for one robot, id ``tdgc/LowLevel-v0``.
+    """``LowLevelTask`` with one robot, id ``tdgc/LowLevel-v0``.
 
     Observations are what the actor sees (``tdgc.sim.locomotion.actor_layout``), followed by what
-    only the critic does (``CRITIC_LAYOUT``), (90 + 40,) by default; actions are (12,) in [-4, 4]:
-    offsets of the joint targets from the nominal pose, in units of ``action_scale``. A step is a
-    control step, 0.02 s.
+    only the critic sees (``CRITIC_LAYOUT``), (90 + 40,) by default. Actions are (12,) in [-4, 4]:
+    offsets of the joint targets from q0 (``Locomotion.pose``), in units of ``action_scale``, for
+    hips times ``hip_scale``. A step is one control step, 0.02 s.
 
     Args:
-        config: the MDP; the default one, on a plane, if None.
+        config: the MDP's configuration; the default one, on a plane, if None.
         render_mode: None or rgb_array.
     """
 

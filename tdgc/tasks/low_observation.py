@@ -1,4 +1,4 @@
-"""What the low policy's networks see: the actor a ``Locomotion``, the critic also its ground."""
+"""What the low policy's networks observe; the critic also sees the true state and the ground."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 class Seen(NamedTuple):
-    """What the critic's own terms are read from."""
+    """The sources of the critic's own terms."""
 
     loco: Locomotion
     ground: Ground
 
 
 def _dynamics(seen: Seen) -> Array:
-    """What was randomised, each in a unit that makes it of order one."""
+    """The randomised dynamics, (M, 6), each scaled to be of order one."""
     loco, world = seen.loco, seen.loco.world
     return np.stack(
         [
@@ -55,7 +55,7 @@ CRITIC_LAYOUT: tuple[Term[Seen], ...] = (
 
 
 def low_spaces(config: LowLevelConfig) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """Observations, [actor part | critic part], and actions of the low policy."""
+    """Observation space, [actor part | critic part], and action space of the low policy."""
     size = width(actor_layout(config.robot, config.gyro)) + width(CRITIC_LAYOUT)
     limit = config.robot.action_limit
     seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
@@ -64,6 +64,6 @@ def low_spaces(config: LowLevelConfig) -> tuple[gym.spaces.Box, gym.spaces.Box]:
 
 def low_mirror(config: LowLevelConfig) -> "Mirror":
     """Left-right mirror of the low policy's observations and actions."""
-    from tdgc.policies import Mirror  # the low policy's workers do without PyTorch
+    from tdgc.policies import Mirror  # here, so that the low policy's workers need no PyTorch
 
     return Mirror(*mirror((*actor_layout(config.robot, config.gyro), *CRITIC_LAYOUT)), *JOINTS)

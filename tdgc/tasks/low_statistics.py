@@ -1,4 +1,4 @@
-"""Sums over the control steps of the low policy's training, and the log's values made of them."""
+"""Sums over the control steps of the low policy's training, and the values logged from them."""
 
 from collections.abc import Mapping
 
@@ -15,9 +15,9 @@ from tdgc.tasks.statistics import mean_rewards
 def by_gait(loco: Locomotion, terms: Mapping[str, Array]) -> dict[str, Array]:
     """Sums over the robots in each gait after a control step, (4,) each.
 
-    ``steps``: how many there are; ``lin`` and ``yaw``: squared errors of velocity, m^2/s^2, and yaw
-    rate, rad^2/s^2; ``match``: shares of feet in contact as desired; ``track_lin_vel`` and
-    ``track_yaw_rate``: of the reward ``terms``, 0 where one is switched off.
+    ``steps``: number of robots; ``lin`` and ``yaw``: squared errors of the velocity, m^2/s^2, and
+    the yaw rate, rad^2/s^2; ``match``: share of feet whose contact is as desired;
+    ``track_lin_vel`` and ``track_yaw_rate``: these reward ``terms``, 0 if switched off.
     """
     state, nothing = loco.world.state, np.zeros(loco.num_robots)
     in_contact, wanted = state.foot_force > CONTACT_FORCE, loco.clock.contact > 0.5
@@ -34,7 +34,7 @@ def by_gait(loco: Locomotion, terms: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def summarise(sums: Mapping[str, float]) -> dict[str, float]:
-    """Sums of ``LowLevelTask.take_stats`` over all workers -> values to log."""
+    """Turn ``LowLevelTask.take_stats``, summed over all workers, into values to log."""
     values = mean_rewards(sums)
     values["falls_per_minute"] = sums.get("falls", 0.0) / (sums.get("minutes", 0.0) or 1.0)
     for key, value in sums.items():

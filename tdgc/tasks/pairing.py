@@ -1,4 +1,4 @@
-"""A low policy from its file, and the MDP of a high policy on it."""
+"""Load a low policy, and fit a high policy's MDP to it."""
 
 import dataclasses
 from pathlib import Path
@@ -11,16 +11,16 @@ from tdgc.policies import Policy
 from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
 from tdgc.sim.robot import NUM_JOINTS
 
-#: Where the shipped policies are.
+#: Folder of the shipped policies.
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
 
-#: What a high policy decides, beside the gait, when its ``behaviour`` is "velocities".
+#: What a high policy decides besides the gait when its ``behaviour`` is "velocities".
 VELOCITIES = ("vx", "vy", "yaw_rate")
 
 
 def at_default(ranges: CommandRanges) -> CommandRanges:
-    """Bounds that leave only the velocities free: the others at their defaults, or at the bound
-    next to it."""
+    """Bounds that leave only the velocities free; the other commands are pinned at their defaults,
+    or at the nearest bound."""
     default, pinned = default_command(), {}
     for name in CONTINUOUS:
         if name not in VELOCITIES:
@@ -30,11 +30,11 @@ def at_default(ranges: CommandRanges) -> CommandRanges:
 
 
 def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
-    """The MDP of a high policy on a low policy: with the decoder's bounds, the low policy's if it
-    has none.
+    """The high policy's MDP with the decoder's bounds filled in: the low policy's, if it sets none.
 
     Raises:
-        ConfigError: bounds that the low policy was not trained on; names the command and both.
+        ConfigError: bounds that the low policy was not trained on; names the command and both
+            ranges.
     """
     ranges = high.commands or low.commands
     if high.behaviour == "velocities":
@@ -50,10 +50,10 @@ def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
 
 
 def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
-    """A low policy, given itself or by its path, and the MDP it was trained on.
+    """A low policy, passed as such or as a path, and the MDP it was trained on.
 
     Raises:
-        ValueError: a file that cannot be used, or a policy that is no low policy.
+        ValueError: a file that cannot be used, or a policy that is not a low policy.
     """
     name, low = low, low if isinstance(low, Policy) else policies.load(low)
     if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:

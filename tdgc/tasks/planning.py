@@ -1,29 +1,29 @@
-"""The way around pillars, on a grid: what a place costs, and the least cost from there on."""
+"""Ways around pillars on a grid: the cost of each place, and the least cost to go from there."""
 
 import numpy as np
 
 from tdgc.sim.robot import Array
 
-LOOK = 0.35  # m ahead, where a robot looks for the lower cost
-#: m from a pillar that is blocked: half the trunk's diagonal and a little. Two pillars leave 0.6 m
-#: between them.
+LOOK = 0.35  # m ahead, the distance at which a robot compares costs in different directions
+#: m from a pillar within which the way is blocked: half the trunk's diagonal and a little. Pillars
+#: leave at least 0.6 m between them.
 RADIUS = 0.28
-_BLOCKED, _CLOSE = 30.0, 3.0  # cost of a metre inside the radius and at it; 1 in the open
+_BLOCKED, _CLOSE = 30.0, 3.0  # cost per metre inside the radius and at its edge; 1 in the open
 _AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 
 
 def price_near(away: Array, wide: float) -> Array:
-    """Cost of a metre ``away`` (...) m from the nearest pillar, which costs up to ``wide`` m."""
+    """Cost per metre at ``away`` (...) m from the nearest pillar, which counts up to ``wide`` m."""
     near = np.clip((wide - away) / (wide - RADIUS), 0.0, 1.0)
     return np.where(away < RADIUS, _BLOCKED, 1.0 + (_CLOSE - 1.0) * near)
 
 
 def cost_to_go(cost: Array, price: Array) -> Array:
-    """Least cost of getting out from each cell of a grid, (n, m).
+    """Least cost of reaching an exit from each cell of a grid, (n, m).
 
     Args:
-        cost: (n, m) where one is out; inf elsewhere.
-        price: (n, m) of a step of one cell from each; one aslant is longer.
+        cost: (n, m) final cost of each exit cell; inf elsewhere.
+        price: (n, m) cost of a step from each cell to the next; a diagonal step is longer.
     """
     n, m = cost.shape
     while True:
@@ -38,7 +38,7 @@ def cost_to_go(cost: Array, price: Array) -> Array:
 
 
 def between(grid: Array, at: Array) -> Array:
-    """Values (k,) of a grid (n, m) between its cells, at (k, 2) in cells."""
+    """Bilinear interpolation of a grid (n, m) at (k, 2) points in units of cells: (k,)."""
     i, j = np.floor(at).astype(int).T
     a, b = at.T - (i, j)
     return (1 - a) * ((1 - b) * grid[i, j] + b * grid[i, j + 1]) + a * (

@@ -1,4 +1,4 @@
-"""Random pushes in training: now and then a robot's trunk gets another horizontal velocity."""
+"""Random pushes in training: sudden changes of a trunk's horizontal velocity."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,14 +9,14 @@ from tdgc.sim.world import World
 
 
 class Pushes:
-    """Pushes of M robots.
+    """Random pushes of M robots.
 
     Args:
-        config: how strong and how often.
-        rng: what they are drawn from.
+        config: strength and interval of the pushes.
+        rng: source of randomness.
         step_seconds: s between two steps of the task.
-        due: (M,) step of its episode at which each robot is pushed next, changed in place; where it
-            holds whole numbers, times are rounded down to steps.
+        due: (M,) step of its episode at which each robot is pushed next, changed in place; an
+            integer array rounds intervals down to whole steps.
     """
 
     def __init__(
@@ -30,12 +30,12 @@ class Pushes:
         self._due = due
 
     def schedule(self, index: NDArray[np.integer], elapsed: NDArray[np.integer]) -> None:
-        """Draw the next push of the robots ``index`` (n,), ``elapsed`` (M,) steps into theirs."""
+        """Draw when the robots ``index`` (n,) are pushed next; ``elapsed`` (M,) steps so far."""
         wait = self._rng.uniform(*self._config.push_interval, len(index)) / self._step_seconds
         self._due[index] = elapsed[index] + np.maximum(1.0, wait).astype(self._due.dtype)
 
     def push(self, world: World, elapsed: NDArray[np.integer], width: Array) -> None:
-        """Push those that are due; ``width`` (M,) scales the speeds, as ``config.scale`` does."""
+        """Push the robots that are due; ``width`` (M,) scales speeds as ``config.scale`` does."""
         index = np.flatnonzero(elapsed >= self._due)
         if not index.size:
             return

@@ -1,8 +1,8 @@
-"""Reward terms: one pure function each, on arrays of M robots, and the tables that weigh them.
+"""Reward terms, each a pure function on arrays of M robots, and the tables that list them.
 
 Low policy (Sec. IV-A): the terms of Walk These Ways that the paper names or needs. A term returns
 the raw quantity, (M,); its sign and weight come from ``LowRewardConfig``. ``total`` combines them
-as Walk These Ways does, so that good gait multiplies what tracking earns:
+as Walk These Ways does, so that a good gait multiplies the tracking reward:
 
     R = dt * (sum of positive terms) * exp(sum of negative terms)
 """
@@ -19,15 +19,15 @@ from tdgc.sim.geometry import FRONT, SIDE
 from tdgc.sim.robot import Array, RobotState, foot_travel
 
 CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact
-_SOFT_LIMIT = 0.9  # share of a joint's range that costs nothing (Walk These Ways)
+_SOFT_LIMIT = 0.9  # share of a joint's range without a penalty (Walk These Ways)
 _FORCE_SCALE = 100.0  # N^2, swing contact force (Walk These Ways)
 _SPEED_SCALE = 10.0  # m^2/s^2, stance foot speed (Walk These Ways)
-_LEG_FORCE = 0.1  # N, a leg contact that counts (Walk These Ways)
+_LEG_FORCE = 0.1  # N, above which a leg contact counts (Walk These Ways)
 
 
 @dataclass
 class LowStep:
-    """All that the low policy's terms look at, one control step of M robots.
+    """Inputs of the low policy's terms for one control step of M robots.
 
     Attributes:
         state: the robots after the step.
@@ -40,8 +40,8 @@ class LowStep:
         targets: (3, M, 12) rad, joint targets of this step and the two before.
         actions: (2, M, 12), this action and the one before.
         acceleration: (M, 12) rad/s^2 of the joints over the step.
-        last_tilt: (M, 2) x and y of gravity in the trunk's frame a gait cycle ago.
-        was_contact: (M, 4) bool, contact at the step before.
+        last_tilt: (M, 2) x and y of gravity in the trunk's frame one gait cycle ago.
+        was_contact: (M, 4) bool, contact at the previous step.
         sigma_lin, sigma_yaw: scales of the tracking terms.
     """
 
@@ -86,14 +86,14 @@ def body_height(s: LowStep) -> Array:
 
 
 def commanded_gravity(pitch: Array, roll: Array) -> Array:
-    """Unit gravity in a body pitched (nose down +) and rolled (left up +): (M,) -> (M, 3)."""
+    """Unit gravity in a body with pitch (nose down +) and roll (left up +): (M,) -> (M, 3)."""
     return np.stack(
         [np.sin(pitch), -np.cos(pitch) * np.sin(roll), -np.cos(pitch) * np.cos(roll)], axis=-1
     )
 
 
 def orientation(s: LowStep) -> Array:
-    """Squared xy error of the projected gravity against commanded pitch and roll."""
+    """Squared xy error of the projected gravity against the commanded pitch and roll."""
     wanted = commanded_gravity(s.cmd("pitch"), s.cmd("roll"))
     return _square_sum((s.state.gravity - wanted)[:, :2])
 
@@ -101,7 +101,7 @@ def orientation(s: LowStep) -> Array:
 def raibert_targets(command: Array, phases: Array) -> Array:
     """Footholds of Raibert's rule in the heading frame: (M, 15), (M, 4) -> (M, 4, 2) m.
 
-    The corners of the commanded stance rectangle, led by ``robot.foot_travel``.
+    They are the corners of the commanded stance rectangle, shifted by ``robot.foot_travel``.
     """
     half = 0.5 * np.stack(
         [command[:, INDEX["stance_length"]], command[:, INDEX["stance_width"]]], axis=-1
@@ -120,7 +120,7 @@ def raibert_foothold(s: LowStep) -> Array:
 
 
 def swing_height(s: LowStep) -> Array:
-    """Squared error of the feet's height against the swing profile, weighed by 1 - C, m^2."""
+    """Squared error of the feet's height against the swing profile, weighted by 1 - C, m^2."""
     wanted = s.cmd("swing_height")[:, None] * s.swing + s.state.geometry.foot_radius
     return np.sum((s.foot_height - wanted) ** 2 * (1.0 - s.contact), axis=1)
 
@@ -160,12 +160,12 @@ def foot_slip(s: LowStep) -> Array:
 
 
 def leg_collision(s: LowStep) -> Array:
-    """Number of legs that touch the ground above the foot."""
+    """Number of legs in contact above the foot."""
     return np.sum(s.state.leg_force > _LEG_FORCE, axis=1).astype(np.float64)
 
 
 def joint_limits(s: LowStep) -> Array:
-    """How far joints are beyond 0.9 of their range, summed, rad."""
+    """How far joints are outside the middle 0.9 of their range, summed, rad."""
     limits = s.state.geometry.joint_limits
     middle = limits.mean(axis=1)
     half = 0.5 * _SOFT_LIMIT * (limits[:, 1] - limits[:, 0])
@@ -183,7 +183,7 @@ def tilt_rate(s: LowStep) -> Array:
 
 
 def nodding(s: LowStep) -> Array:
-    """Squared change of the trunk's tilt against a gait cycle ago, of gravity's unit vector."""
+    """Squared change, within one gait cycle, of the xy of unit gravity in the trunk's frame."""
     return _square_sum(s.state.gravity[:, :2] - s.last_tilt)
 
 
@@ -203,7 +203,7 @@ def joint_accelerations(s: LowStep) -> Array:
 
 
 def power(s: LowStep) -> Array:
-    """Mechanical power spent, at the commanded price: power_weight * sum |torque * speed|."""
+    """Mechanical power at the commanded price: power_weight * sum |torque * speed|."""
     return s.cmd("power_weight") * np.sum(np.abs(s.state.torque * s.state.qd), axis=1)
 
 
@@ -253,8 +253,8 @@ def total(
 ) -> Array:
     """R = dt (sum of positive terms) exp(penalty (sum of negative terms)), (M,).
 
-    A term's group follows from the sign of its weight; ``penalty`` (M,) is the share of the
-    negative ones that counts.
+    The sign of its weight decides a term's group. ``penalty``, (M,) or a scalar, is the share of
+    the negative terms that counts.
     """
     positive: Array | float = 0.0
     negative: Array | float = 0.0
@@ -271,10 +271,10 @@ def total(
 
 @dataclass
 class HighStep:
-    """All that the high policy's terms look at, one decision of M robots (Sec. IV-B).
+    """Inputs of the high policy's terms for one decision of M robots (Sec. IV-B).
 
     Attributes:
-        distance: (M,) m to the goal on the map, d_t; a goal has no height here.
+        distance: (M,) m to the goal, d_t, horizontal: a goal has no height here.
         heading_error: (M,) rad, psi* - psi.
         time_share: (M,) t / T_max.
         lin_vel, ang_vel: (M, 3) of the base, m/s and rad/s; joint_speed: (M, 12) rad/s.
@@ -349,7 +349,7 @@ def command_acceleration(s: HighStep) -> Array:
 
 
 def contact_force(s: HighStep) -> Array:
-    """r_col = sum_j max(0, |F_j| - F_th), of the trunk and the legs above the feet."""
+    """r_col = sum_j max(0, |F_j| - F_th), over the trunk and the legs above the feet."""
     return np.sum(np.maximum(s.contact_forces - s.config.force_threshold, 0.0), axis=1)
 
 
@@ -382,10 +382,10 @@ if not set(HIGH_TERMS) <= {f.name for f in dataclasses.fields(HighRewardConfig)}
 
 
 def high_terms(step: HighStep, dt: float) -> dict[str, Array]:
-    """Every enabled term times its effective weight w_i dt (step-time scaling), (M,) each; w_i
-    alone without ``step_time_scaling``.
+    """Every enabled term times its effective weight, (M,) each.
 
-    The high policy's reward is their plain sum.
+    The effective weight is w_i dt (step-time scaling), or w_i without ``step_time_scaling``. The
+    high policy's reward is the plain sum of these terms.
     """
     scale = dt if step.config.step_time_scaling else 1.0
     return {

@@ -1,4 +1,4 @@
-"""The rules of an episode (paper Sec. IV-C; TDGC-Bench, "Episode"): when it ends, and how."""
+"""When and how an episode ends (paper Sec. IV-C; TDGC-Bench, "Episode")."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ TRUNK_FORCE = 40.0  # N (paper Sec. IV-C)
 GOAL_RADIUS = 0.5  # m (paper Sec. IV-C)
 HORIZON = 20.0  # s (TDGC-Bench)
 
-#: How an episode can end. Beside these an episode that goes on is -1.
+#: How an episode can end; ``GOING`` stands for one that continues.
 OUTCOMES = ("reached", "fell", "collided", "left_tile", "timeout")
 REACHED, FELL, COLLIDED, LEFT_TILE, TIMEOUT = range(len(OUTCOMES))
 GOING = -1
@@ -20,15 +20,15 @@ GOING = -1
 def outcome(
     world: World, goal: Array | None = None, time_is_up: NDArray[np.bool_] | bool = False
 ) -> NDArray[np.int64]:
-    """How each robot's episode ends now, (M,): an index into ``OUTCOMES``, ``GOING`` if it doesn't.
+    """How each robot's episode ends now, (M,): an index into ``OUTCOMES``, or ``GOING``.
 
-    Failure goes before success: a robot that falls into the goal has fallen. Robot i is on tile
-    (i, 0) of the world's field.
+    Failure takes precedence over success: a robot that falls into the goal has fallen. Robot i is
+    on tile (i, 0) of the world's field.
 
     Args:
         world: the robots; on a plane, which has no field, there is no tile to leave.
-        goal: (M, 2) m in the world, reached on the map; without one nothing is reached.
-        time_is_up: (M,), or one for all.
+        goal: (M, 2) m in the world; only the horizontal distance counts. None: nothing is reached.
+        time_is_up: (M,), or a single value for all robots.
     """
     x, y, z = world.state.position.T
     ended = np.where(time_is_up, TIMEOUT, np.full(len(x), GOING))
@@ -42,11 +42,11 @@ def outcome(
 
 
 def has_failed(ended: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which of these outcomes are failures: all ends but reaching the goal and running out of
-    time, which truncates an episode."""
+    """Which outcomes are failures: all except reaching the goal and running out of time, which
+    truncates an episode."""
     return np.isin(ended, (FELL, COLLIDED, LEFT_TILE))
 
 
 def is_fallen(world: World) -> NDArray[np.bool_]:
-    """The failures that concern the body alone: trunk low or hit, (M,)."""
+    """Whether each robot has fallen or collided, the failures of the body alone, (M,)."""
     return np.isin(outcome(world), (FELL, COLLIDED))

@@ -1,4 +1,4 @@
-"""Sums over the steps of a training, and what both trainings log of them."""
+"""Sums over training steps, and the values that the training of either policy logs from them."""
 
 from collections.abc import Mapping
 
@@ -6,14 +6,14 @@ from tdgc.sim.robot import Array
 
 
 class Sums(dict[str, float]):
-    """Numbers that are added up by name."""
+    """Named running sums."""
 
     def add(self, name: str, value: float) -> None:
-        """Add to one of them, which begins at 0."""
+        """Add ``value`` to the sum ``name``, which starts at 0."""
         self[name] = self.get(name, 0.0) + float(value)
 
     def add_rewards(self, terms: Mapping[str, Array], reward: Array) -> None:
-        """Add a step of M robots: its reward (M,) and the reward's terms, (M,) each."""
+        """Add one step of M robots: its reward (M,) and the reward terms, (M,) each."""
         self.add("steps", len(reward))
         self.add("reward", reward.sum())
         for name, value in terms.items():
@@ -21,7 +21,7 @@ class Sums(dict[str, float]):
 
 
 def mean_rewards(sums: Mapping[str, float]) -> dict[str, float]:
-    """Mean of the reward and of each of its terms per step, of ``Sums`` over all workers."""
+    """Mean reward and reward terms per step, from ``Sums`` added over all workers."""
     steps = max(sums.get("steps", 0.0), 1.0)
     terms = {k.removeprefix("term/"): v for k, v in sums.items() if k.startswith("term/")}
     return {"reward/total": sums.get("reward", 0.0) / steps} | {

@@ -1,4 +1,4 @@
-"""One robot of a task as a Gymnasium environment; both MDPs have such a face."""
+"""The Gymnasium interface that both MDPs share."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 
 class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """One robot of a task as a Gymnasium environment.
+    """A task with one robot as a Gymnasium environment.
 
-    It is the MDP of training: dynamics are randomised, the robot is pushed, sensors are noisy, and
-    levels move with success. ``reset`` goes on with the robot's level; ``reset(seed=...)`` makes
-    the task again from that seed, so that all that follows is repeatable. ``info["is_success"]``
-    says whether the goal was reached, or what was to be crossed.
+    This is the MDP used in training: dynamics are randomised, the robot is pushed, sensors are
+    noisy, and levels change with success. ``reset`` keeps the robot's level; ``reset(seed=...)``
+    rebuilds the task from that seed, so that everything after it is repeatable.
+    ``info["is_success"]`` reports whether the robot has reached its goal or crossed its tile.
 
     Args:
-        make_task: (seed, whether pictures are wanted) -> the task of one robot.
-        render_mode: None, or rgb_array for pictures of 640 x 400.
+        make_task: (seed, whether to render) -> a task with one robot.
+        render_mode: None, or rgb_array for images of 640 x 400 pixels.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012  as in gymnasium

@@ -1,10 +1,10 @@
-"""A scripted expert on each training family, which the high policy first imitates.
+"""A scripted expert for each training family, which the high policy imitates first.
 
-It is told what the high policy has to find out from its cues: where on the tile the robot is and
-how fast, the way around pillars, the lines of the trenches. How a family wants to be walked was
-tried on training tiles (docs/experiments.md). Leaps over trenches show why imitation comes first:
-pronk at nearly full speed, its steps timed to a few centimetres, is nothing that exploring from a
-trot finds.
+It is told what the high policy has to infer from its cues: the robot's position on the tile and its
+speed, the way around pillars, and where the trenches are. How to walk on each family was found by
+trials on training tiles (docs/experiments.md). Leaps over trenches show why imitation comes first:
+they take pronk at nearly full speed with steps timed to a few centimetres, which exploration that
+starts from a trot does not find.
 """
 
 import dataclasses
@@ -39,13 +39,13 @@ class Style:
     """How to walk in trot.
 
     Attributes:
-        speed: m/s, ahead.
+        speed: m/s, forward.
         frequency: Hz.
         swing_height, stance_width, body_height: m.
         duration: duty factor.
         pitch: rad, nose down positive.
-        uphill: m/s across a slope, against sliding down, where the slope is vertical; on others as
-            the slope's sine.
+        uphill: m/s, times the sine of a lateral slope: the velocity up that slope, against sliding
+            down.
     """
 
     speed: float
@@ -58,7 +58,7 @@ class Style:
     uphill: float = 0.0
 
     def command(self) -> Array:
-        """The style as a command, (15,), standing still."""
+        """The style as a command to stand still, (15,)."""
         command = default_command()
         for name in (
             "frequency", "swing_height", "stance_width", "body_height", "duration", "pitch"
@@ -67,7 +67,7 @@ class Style:
         return command
 
 
-#: On steps and bumps, and in families that have no style of their own.
+#: Style on steps and bumps, and for families without a style of their own.
 UNEVEN = Style(
     0.6,
     frequency=2.3,
@@ -77,28 +77,29 @@ UNEVEN = Style(
     duration=0.55,
     pitch=-0.07,
 )
-#: A family's style. Numbers beside the defaults of Walk These Ways are from docs/experiments.md.
+#: Style of each family. Values other than Walk These Ways' defaults are from docs/experiments.md.
 STYLES = {
     "rough": UNEVEN,
-    # Slower, but no lower: what looks like a pillar from afar may be a step on ground never met.
+    # Slower, with feet and trunk as high: what looks like a pillar from afar may be a step on
+    # unfamiliar ground.
     "pillar": dataclasses.replace(UNEVEN, speed=0.5),
     "stair": UNEVEN,
-    # in pronk, see ``tdgc.tasks.leaps``
+    # In pronk, see ``tdgc.tasks.leaps``.
     "gap": Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1),
     "tilt": Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45),
     **dict.fromkeys(UNNAMED, UNEVEN),
 }
 
-#: m ahead that the probes see a trench; they reach 1.2 m.
+#: m ahead at which the probes see a trench; they reach 1.2 m.
 SIGHT = 1.15
 
-# The way around pillars follows a field of travel costs on every second sample of the tile.
+# Ways around pillars follow a field of travel costs on every second sample of the tile.
 _COARSE = 2
-_SEEN = 0.5  # share of the speed seen at a decision in the estimate: it swings within a gait cycle
-_WIDE = 0.55  # m from a pillar, where it ceases to cost
+_SEEN = 0.5  # weight of a newly seen speed in the estimate: it oscillates within a gait cycle
+_WIDE = 0.55  # m from a pillar, beyond which it adds no cost
 _RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)
-_APART = 0.9  # rad between two ways around, whose mean would lead into what stands between them
-#: What the ways around a pillar differ in.
+_APART = 0.9  # rad, least angle between two ways whose mean would lead into the obstacle
+#: Commands in which the two ways around a pillar differ.
 WAY = [INDEX[name] for name in ("vx", "vy", "yaw_rate")]
 
 
@@ -112,13 +113,14 @@ def toward(
 ) -> tuple[Array, Array]:
     """Forward speed in m/s and yaw rate in rad/s towards a point, (M,) each.
 
-    As fast as the distance asks, turning by the heading error, and slower while facing away.
+    The speed is proportional to the distance, up to ``top_speed``, and falls with the cosine of the
+    heading error to 0 when the robot faces away; the yaw rate is proportional to that error.
 
     Args:
-        distance, error: (M,) m and rad, of the point's bearing against the heading.
-        top_speed: (M,) or one for all, m/s.
+        distance, error: (M,) m to the point, and (M,) rad, its bearing relative to the heading.
+        top_speed: m/s, (M,) or a scalar.
         distance_gain, heading_gain: 1/s.
-        turns: rad/s, least and greatest yaw rate.
+        turns: rad/s, lowest and highest yaw rate.
     """
     speed = np.minimum(top_speed, distance_gain * distance)
     turn = np.clip(heading_gain * error, *turns)
@@ -126,13 +128,13 @@ def toward(
 
 
 def travel_cost(pillars: Array, width: int, left: float, goal: Array) -> tuple[Array, float, float]:
-    """Cost of travelling to the goal from all over a tile, around its pillars.
+    """Cost of travelling to the goal, around pillars, from every point of a tile.
 
     Args:
         pillars: (k, 3) m, x, y and diameter.
         width: samples across the tile.
-        left: m, y of the first of them in the tile's frame.
-        goal: (2,) m.
+        left: m, y of the first of these samples in the tile's frame.
+        goal: (2,) m in the tile's frame.
 
     Returns:
         The field (81, width // 2 + 1), its step in m, and ``left``.
@@ -151,21 +153,22 @@ def travel_cost(pillars: Array, width: int, left: float, goal: Array) -> tuple[A
 
 
 class Teacher:
-    """Commands robots on tiles of their own.
+    """Commands M robots, each on a tile of its own.
 
     Args:
         field: (M, 1) tiles.
-        families: of the robots, (M,) names.
-        ranges: of the commands that their low policy was trained on.
-        landing: of the low policy; None for one that does not leap, which walks over trenches.
+        families: (M,) names of the tiles' families.
+        ranges: command ranges that the low policy was trained on.
+        landing: the low policy's; None for one that cannot leap, which walks over trenches.
 
     Attributes:
-        speed: (M,) m/s ahead, as leaps should have it by now and as it was seen.
-        price: (M, FREQUENCIES, LENGTHS) of the last ``commands``, what each step frequency with
-            each stance length would have cost more than the best; 0 for robots that do not leap.
-        other: (M, 15) the last ``commands``, but by the second way around what is in the way; the
-            same commands where there is none.
-        dearer: (M,) m, how much longer the second way is, with a price on being near pillars.
+        speed: (M,) m/s forward, an estimate from how leaps speed up and from the speeds seen.
+        price: (M, FREQUENCIES, LENGTHS) for the last ``commands``, how much more than the best
+            choice each step frequency with each stance length would have cost; 0 for robots that
+            do not leap.
+        other: (M, 15) the last ``commands``, but along the second way around an obstacle; the same
+            commands where there is no second way.
+        dearer: (M,) m, how much longer the second way is, including the cost of being near pillars.
     """
 
     def __init__(
@@ -185,7 +188,7 @@ class Teacher:
             for family in families
         ]
         commands = np.array([style.command() for style in [*styles, UNEVEN, STYLES["gap"]]])
-        # A low policy may have been trained on less than the styles ask for.
+        # The low policy may have been trained on narrower ranges than the styles use.
         bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
         behaviour = commands[:, : len(CONTINUOUS)]
         np.clip(behaviour, bounds[:, 0], bounds[:, 1], out=behaviour)
@@ -196,23 +199,24 @@ class Teacher:
         self.dearer = np.zeros(m)
         self._top_speed = np.array([style.speed for style in styles])
         self._uphill = np.array([style.uphill for style in styles])
-        self._climb = np.zeros(m)  # m/s to the left of the tile's length
+        self._climb = np.zeros(m)  # m/s uphill, positive along the tile's y (left)
         self._plan = LeapPlan(m, ranges)
         self._leap_speed = min(SPEED, ranges.vx[1])
-        self._start = np.full(m, -np.inf)  # m, x where a robot begins to leap
-        self._end = np.full(m, -np.inf)  # m, x where a robot has no more to leap over
+        self._start = np.full(m, -np.inf)  # m, x where a robot starts to leap
+        self._end = np.full(m, -np.inf)  # m, x where a robot stops leaping
         self._fields: dict[int, tuple[Array, float, float]] = {}
 
     def begin(
         self, index: NDArray[np.integer], goal: Array, untold: NDArray[np.bool_] | None = None
     ) -> None:
-        """Look at the tiles of the robots ``index`` (n,).
+        """Plan leaps and ways around pillars on the tiles of the robots ``index`` (n,).
 
         Args:
-            index: of the robots.
+            index: the robots.
             goal: (M, 2) m in the world.
-            untold: (M,) whose high policy is not told its family; nobody's if None. Such a robot,
-                and one of a family other than Gap, leaps when it sees a trench.
+            untold: (M,) robots whose high policy is not told the family; none if None. Such a
+                robot, like one on a family other than Gap, starts to leap only ``SIGHT`` m before
+                the first trench, when it can see it.
         """
         width = self._field.heights.shape[1]
         self.speed[index] = 0.0
@@ -231,7 +235,7 @@ class Teacher:
             self._fields[int(i)] = travel_cost(pillars, width, self._field.crop, target)
 
     def watch(self, loco: Locomotion, seconds: float) -> None:
-        """See how fast the robots are, once per decision of ``seconds``."""
+        """Update the speed estimates; to be called once per decision of ``seconds``."""
         _, self.speed = speed_up(self.speed, self._leap_speed, seconds)
         self.speed += _SEEN * (loco.world.state.heading_vel[:, 0] - self.speed)
 
@@ -272,7 +276,7 @@ class Teacher:
         """Velocities ``WAY`` (M, 3) towards points at ``distance`` m and ``bearing`` rad."""
         error = wrap_angle(bearing - yaw)
         speed, turn = toward(distance, error, top_speed, turns=self._ranges.yaw_rate)
-        # Around obstacles any way it faces: backward, too, off one that it leans on.
+        # Around obstacles a robot may move in any direction, also backward, off one it leans on.
         any_way = np.where(self._detours, np.minimum(top_speed, distance), 0.0)
         speed = np.where(self._detours, any_way * np.cos(error), speed)
         vx = np.clip(speed + self._climb * np.sin(yaw), *self._ranges.vx)
@@ -281,10 +285,11 @@ class Teacher:
 
 
 def _ways(field: tuple[Array, float, float], at: Array, ahead: float) -> tuple[float, float, float]:
-    """Directions in rad from ``at`` (2,) m in which the travel cost falls most and, apart from
-    there, second most, and what the second costs more, in m; twice the first if there is no other.
+    """Cheapest and second cheapest direction in rad from ``at`` (2,) m, and the difference in cost.
 
-    Near ties go to the direction closest to ``ahead``.
+    The difference is in m. The second direction is a local minimum of the travel cost, below the
+    cost at ``at`` and more than ``_APART`` from the first; without one, the first is returned
+    twice. Near ties go to the direction closest to ``ahead``.
     """
     cost, step, left = field
 

@@ -1,6 +1,6 @@
-"""The tiles that both policies train on: every robot has one of its own, of its family and level.
+"""The tiles that both policies train on: one per robot, of the robot's family and level.
 
-A tile follows from the seed and its number, so a checkpoint holds numbers instead of heights.
+The seed and a tile's number determine the tile, so a checkpoint stores numbers instead of heights.
 """
 
 import dataclasses
@@ -23,19 +23,20 @@ from tdgc.sim.terrain import (
 from tdgc.state import State, copies, fill
 
 # Training tiles are 4 m wide, since Bullet keeps 600 bytes for each sample of a height field.
-TILE_CROP = 2.0  # m at either side
-#: A training family beside those of ``tdgc.sim.terrain``: no relief, and always level 0's heights.
+TILE_CROP = 2.0  # m, on either side
+#: A training family besides those of ``tdgc.sim.terrain``: flat ground at height 0 on every level.
 FLAT = "flat"
-# Episodes on one tile while the level stays. A tile met too often is learned by heart, and to bring
-# a new one into Bullet takes 80 ms, a third of a decision of 50 robots: at 5, one percent in all.
+# Episodes on one tile while the level stays the same. A tile that is used too often is memorised,
+# but loading a new one into Bullet takes 80 ms, a third of the time that 50 robots need for a
+# decision. With 5 episodes, loading takes one percent of the total time.
 _EPISODES = 5
 
 
 def check_families(families: Sequence[str]) -> None:
-    """See that tiles of the families can be made.
+    """Check that tiles of the families can be made.
 
     Raises:
-        ValueError: none, an unknown name, or a height map that cannot be used.
+        ValueError: no family, an unknown name, or a height map that cannot be used.
     """
     if not families:
         raise ValueError("'env.families' must name at least one terrain family")
@@ -44,22 +45,24 @@ def check_families(families: Sequence[str]) -> None:
 
 
 def check_levels(levels: int) -> None:
-    """See that there are so many levels to train on.
+    """Check that there are that many levels to train on.
 
     Raises:
-        ValueError: more than that; those above are the benchmark's, for what no policy has met.
+        ValueError: too many levels; the benchmark reserves those above as terrain that no policy
+            has met.
     """
     if levels > MAX_LEVEL + 1:
         raise ValueError(f"'env.levels' must be from 1 to {MAX_LEVEL + 1}, not {levels}")
 
 
 def shallow(tile: Tile, level: int, shallowest: float) -> Tile:
-    """The tile with trenches that deepen with the square of the level, from ``shallowest`` m on
-    level 0 to all of 60 cm on level 10.
+    """The tile with shallower trenches: their depth grows with the square of the level, from
+    ``shallowest`` m on level 0 to the full 60 cm on level 10.
 
-    At full depth the narrowest trench catches a leg for good, and a robot that falls over the first
-    one whatever it does learns nothing. Deepening evenly was too fast: trot crossed all trenches of
-    5 cm and a fifth of those of 11. Only training is softened, never an evaluation.
+    At full depth even the narrowest trench traps a leg for good, and a robot that falls at the
+    first trench whatever it does learns nothing. A depth linear in the level grows too fast: trot
+    crossed all trenches 5 cm deep, but only a fifth of those 11 cm deep. Only training uses this,
+    never evaluation.
     """
     d = min(1.0, level / MAX_LEVEL)
     depth = shallowest + d * d * (TRENCH_DEPTH - shallowest)
@@ -67,18 +70,18 @@ def shallow(tile: Tile, level: int, shallowest: float) -> Tile:
 
 
 class TrainingTiles:
-    """A tile each for M robots.
+    """One tile for each of M robots.
 
     Args:
-        families: of the robots, (M,) names.
-        seed: of the tiles.
-        alter: (tile, level) -> the tile to be used.
+        families: (M,) terrain family of each robot.
+        seed: seed of the tiles.
+        alter: (tile, level) -> the tile to use instead.
 
     Attributes:
         field: (M, 1) tiles.
-        level, number, episodes: (M,) of each robot's tile: its level, the number it was drawn with
-            (see ``tile_rng``), and how many episodes began on it.
-        drawn: how many tiles were drawn so far.
+        level, number, episodes: (M,) level of each robot's tile, the number it was drawn with (see
+            ``tile_rng``), and how many episodes began on it.
+        drawn: number of tiles drawn so far.
     """
 
     def __init__(
@@ -94,8 +97,8 @@ class TrainingTiles:
         self.drawn = 0
 
     def draw(self, index: NDArray[np.integer], levels: NDArray[np.integer]) -> NDArray[np.integer]:
-        """New tiles for the robots ``index`` (n,) at their levels, of ``levels`` (M,). Returns the
-        robots whose heights changed: some families have but one tile a level."""
+        """Draw new tiles for the robots ``index`` (n,) at their ``levels`` (M,). Returns the robots
+        whose heights changed: some families have only one tile per level."""
         index = index[self._relief[index]]
         self.number[index] = self.drawn + np.arange(len(index))
         self.drawn += len(index)
@@ -104,8 +107,8 @@ class TrainingTiles:
         return self._place(index)
 
     def begin(self, index: NDArray[np.integer], levels: NDArray[np.integer]) -> NDArray[np.integer]:
-        """Episodes of the robots ``index`` (n,) begin: new tiles for those whose level changed or
-        whose tile has served long enough. Returns the robots whose heights changed."""
+        """Start new episodes for the robots ``index`` (n,), with new tiles for those whose level
+        changed or whose tile is due for replacement. Returns the robots whose heights changed."""
         worn = (self.level[index] != levels[index]) | (self.episodes[index] >= _EPISODES)
         changed = self.draw(index[worn], levels)
         self.episodes[index] += 1
@@ -121,17 +124,17 @@ class TrainingTiles:
         return index[(self._heights()[index] != before).any(axis=(1, 2))]
 
     def _heights(self) -> NDArray[np.float32]:
-        """Of each robot's tile, (M, 161, n) m, in place."""
+        """Heights of each robot's tile, (M, 161, n) m, as a view of the field."""
         return self.field.heights.reshape(len(self.families), TILE_SAMPLES, -1)
 
     def _arrays(self) -> dict[str, NDArray[np.int64]]:
         return {"level": self.level, "number": self.number, "episodes": self.episodes}
 
     def state_dict(self) -> State:
-        """The tiles in use, as copies."""
+        """The tiles in use, as copies of their levels, numbers and episode counts."""
         return copies(self._arrays())
 
     def load_state_dict(self, state: State) -> None:
-        """Draw the tiles of a ``state_dict`` again; the field has to be brought into Bullet."""
+        """Rebuild the tiles of a ``state_dict``; the caller then loads the field into Bullet."""
         fill(self._arrays(), state)
         self._place(np.flatnonzero(self._relief))
