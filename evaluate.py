@@ -73,7 +73,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--low", type=Path, default=PRETRAINED / "low", help="low policy (the shipped one)"
     )
     who.add_argument("--high", type=Path, help="high policy (the shipped one)")
-    who.add_argument("--tune", type=Path, metavar="FILE", help="tuning to compare with none")
+    who.add_argument(
+        "--tune", type=Path, metavar="FILE", help="tuning to compare with the original"
+    )
     who.add_argument(
         "--set",
         dest="assignments",
@@ -83,7 +85,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         help="change the tuning, e.g. decoder.vx.high=0.6; may be repeated",
     )
     look = groups.looked_at.add_argument
-    look("--tracking", action="store_true", help="the low policy alone, on a plane")
+    look("--tracking", action="store_true", help="measure the low policy alone, on a plane")
     look(
         "--trace",
         metavar="WHICH",
@@ -95,7 +97,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         nargs="?",
         const="drive",
         choices=gui.MODES,
-        help="Bullet's window instead of a table, on the first tile of the first family and level: "
+        help="open Bullet's window instead, on the first tile of the first family and level: "
         "drive the low policy with sliders (drive), or watch the first policy decide (watch)",
     )
     groups.machine.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)

@@ -284,7 +284,7 @@ def main(arguments: list[str] | None = None) -> int:
         args.assignments.append(f"low={args.low}")
     try:
         if args.resume and (args.no_teacher or PRESETS[args.preset]):
-            raise ConfigError("--resume goes on as its run began: no --preset or --no-teacher")
+            raise ConfigError("--resume keeps the run's settings: no --preset or --no-teacher")
         config = configure(with_overrides(HighTrainConfig(), preset), args)
         config = dataclasses.replace(config, low=config.low or find_low())
         low, low_config = load_low(cast(str, config.low))

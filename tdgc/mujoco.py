@@ -254,7 +254,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     groups.looked_at.add_argument(
         "--gui",
         action="store_true",
-        help="MuJoCo's viewer instead of a table, on the first tile of the first family and level",
+        help="open MuJoCo's viewer instead, on the first tile of the first family and level",
     )
     return parser.parse_args(arguments)
 

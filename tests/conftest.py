@@ -1,4 +1,4 @@
-"""What tests of more than one file need."""
+"""Fixtures and hooks shared by several test files."""
 
 import signal
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture
 def signals() -> Iterator[None]:
-    """Runs take over SIGINT and SIGTERM; give them back."""
+    """Restore the handlers of SIGINT and SIGTERM, which training runs replace."""
     before = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)]
     yield
     for number, handler in before:
@@ -16,5 +16,5 @@ def signals() -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The file that takes longest goes first, so that other processes have work meanwhile."""
+    """Run the slowest file first, so that other test processes have work in the meantime."""
     items.sort(key=lambda item: item.path.name != "test_readme.py")

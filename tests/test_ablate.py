@@ -1,4 +1,4 @@
-"""The ablation: variants that train, trials that go on where they were, a table that is right."""
+"""The ablation: every variant can be trained, trials resume, and the table is correct."""
 
 import itertools
 import json
@@ -40,7 +40,7 @@ def named(name: str) -> Variant:
 @pytest.mark.parametrize("alone", [False, True])
 def test_every_variant_changes_one_thing_and_fits_the_low_policy(alone: bool) -> None:
     base = with_overrides(HighTrainConfig(), NO_TEACHER if alone else ())
-    low = LowLevelConfig()  # of a policy that train_low.py gives
+    low = LowLevelConfig()  # the MDP of a policy trained by train_low.py
     seen = []
     for variant in variants(alone):
         if variant.settings is not None:
@@ -86,7 +86,7 @@ TILES = list(itertools.product(("rough", "gap"), (6,), range(4)))
 
 
 def result(good: str, **facts: float) -> Result:
-    """Tile by tile, 1 where the goal was reached."""
+    """A trial's result; ``good`` has a 1 for each tile whose goal was reached, else 0."""
     return Result(facts, np.array([mark == "1" for mark in good]))
 
 
@@ -114,7 +114,7 @@ def test_rows_are_over_tiles_and_seeds_and_pairs_have_the_same_seed() -> None:
     assert (one["versus"]["n"], one["versus"]["lost"], one["versus"]["gained"]) == (8, 2, 0)
     assert one["versus"]["difference"] == -0.25
     assert "n" not in later and later["errors"] == {}
-    # The script runs once, and is compared with both trainings on the same eight tiles.
+    # The script runs once and is compared with both trainings, on the same eight tiles.
     assert (script["n"], script["versus"]["n"]) == (8, 16) and "steps" not in script
     assert (script["versus"]["lost"], script["versus"]["gained"]) == (8, 2)
     text = describe(table)
@@ -145,8 +145,10 @@ def in_this_process(work: Callable[[Any], Any], jobs: Sequence[Any], _: int) -> 
 def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Stopped in the middle of its first training, then finished with a trial that cannot be. What
-    it trains is what train_high.py trains."""
+    """An ablation stopped during its first training finishes when called again.
+
+    One of its trials cannot run. Its policy is byte for byte the one that train_high.py trains.
+    """
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
     out = tmp_path / "ablation"
@@ -162,7 +164,7 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     with monkeypatch.context() as patch:
         patch.setattr(Interruption, "due", due)
         assert main(command) == 0
-    assert "stopped; the same command goes on" in capsys.readouterr().out
+    assert "stopped; run the same command to continue" in capsys.readouterr().out
     assert policies.load(out / "full-5" / "policy").meta["steps"] == 24
     assert [row.get("n") for row in json.loads((out / "ablation.json").read_text())["rows"]] == [
         None, None, None
@@ -178,7 +180,7 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     assert (pose["n"], pose["versus"]["n"]) == (1, 1) and "steps" not in pose
     assert uncalibrated["errors"] == {"5": f"{missing}: no such file"}
     assert result["settings"]["steps"] == 48 and (out / "ablation.png").is_file()
-    # The copies differ from the policies in the pose alone.
+    # The copy has the fixed pose and the tensors of its policy.
     changed, given = policies.load(out / "fixed-pose-5" / "low"), policies.load(LOW)
     assert not changed.meta["config"]["robot"]["commanded_pose"]
     assert all((changed.tensors[n] == given.tensors[n]).all() for n in given.tensors)
@@ -187,7 +189,7 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     assert train_high.main([*flags, "--out", str(tmp_path / "alone")]) == 0
     alone = (tmp_path / "alone" / "policy.safetensors").read_bytes()
     assert (out / "full-5" / "policy.safetensors").read_bytes() == alone
-    # A third call has nothing to do but what failed; others than these settings are refused.
+    # A finished trial is not run again; other settings for the same folder are refused.
     before = (out / "full-5" / "cell.json").stat().st_mtime_ns
     assert main([*command[:-2], "--only", "full", "--out", str(out)]) == 0
     assert (out / "full-5" / "cell.json").stat().st_mtime_ns == before
@@ -200,7 +202,10 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
 def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two minibatches of two robots' rollouts leave none for one; ``gp`` needs no training."""
+    """Five minibatches of 4 robots' 6 steps hold 4 steps each, fewer than one robot's rollout.
+
+    So ``full`` fails, and with it ``fixed-pose``, which needs it; ``gp`` needs no training.
+    """
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
     flags = [*TINY, "--set", "ppo.minibatches=5", "--only", "full,fixed-pose,gp"]
@@ -210,7 +215,7 @@ def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
         "42": "a minibatch of 4 steps does not hold the 6 of one environment; take fewer "
         "minibatches or more environments"
     }
-    assert table[1]["errors"] == {"42": "it needs 'full' with seed 42, which is not done"}
+    assert table[1]["errors"] == {"42": "it needs 'full' with seed 42, which is missing"}
     assert (table[2]["n"], table[2]["errors"]) == (1, {})
     assert capsys.readouterr().err.count("tdgc.ablate: ") == 2
 
@@ -219,7 +224,7 @@ EPISODES = "evaluation/episodes.csv"
 
 
 def finish(folder: Path) -> None:
-    """Leave a trial as it is when it is done on ``TINY``'s only tile."""
+    """Write the files of a trial that is done, on the only tile of ``TINY``."""
     (folder / "evaluation").mkdir(parents=True)
     facts = {"evaluate_seconds": 1.0, "steps": 48, "train_seconds": 2, "simulated_hours": 0.0}
     (folder / "cell.json").write_text(json.dumps(facts))
@@ -247,7 +252,7 @@ def test_a_damaged_trial_is_named_and_the_others_are_kept(
     file: str, text: str | None, message: str,
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """Both of them are done, but for the last two files: those count while a training ends."""
+    """Both trials are done, except in the last two cases: those files are read after training."""
     for name in ("full-42", "trot-42"):
         finish(tmp_path / name)
     path = tmp_path / "trot-42" / file
@@ -273,7 +278,7 @@ def test_time_that_is_over_stops_before_a_trial(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*TINY, "--only", "full", "--time-limit", "0", "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.endswith("stopped; the same command goes on\n")
+    assert capsys.readouterr().out.endswith("stopped; run the same command to continue\n")
     assert not (tmp_path / "full-42").exists()
 
 
@@ -282,7 +287,7 @@ def test_time_that_is_over_stops_before_a_trial(
     [("gap,clutter,gap,ditches", "gap"), ("ditches,clutter", "ditches,clutter")],
 )
 def test_ground_without_a_name_is_not_evaluated_on(trained: str, evaluated: str) -> None:
-    """Unless there is no other to evaluate on."""
+    """Families in ``UNNAMED`` are left out of the evaluation unless there are no others."""
     settings = (f"env.families={json.dumps(trained.split(','))}",)
     runner = Runner(Path(), PRETRAINED / "low", False, settings, None, "6", 1, 1, None)
     flags = runner.evaluation_flags("gp", runner.low, None)

@@ -1,4 +1,4 @@
-"""What the benchmark of the simulation measures and writes; not how fast it is."""
+"""``tdgc.bench``: what it measures and writes, but not how fast this machine is."""
 
 import dataclasses
 import functools
@@ -21,7 +21,7 @@ from tdgc.tasks.low_observation import low_spaces
 
 
 def test_robots_are_spread_over_the_levels() -> None:
-    """Five robots in two workers, of which each spreads its own; all begin new episodes."""
+    """Each of two workers spreads its own share of five robots, and all begin new episodes."""
     config = LowLevelConfig()
     env = TaskVecEnv(functools.partial(LowLevelTask, config), 5, 2, 0, low_spaces(config))
     env.reset()
@@ -61,7 +61,7 @@ def test_load(
 def test_the_high_levels_update(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Both learners on a small configuration; each of them is to have changed its parameters."""
+    """On a small configuration, each learner changes every tensor of its policy."""
     config = HighTrainConfig(n_envs=4)
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, n_steps=8, lstm=8))
     monkeypatch.setattr(bench, "HighTrainConfig", lambda: config)
@@ -85,7 +85,7 @@ def test_the_high_levels_update(
 
 
 def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a clock that the updates move, of which the first does not count."""
+    """The clock is advanced by the updates only; the first update of a learner does not count."""
     taken = {
         RecurrentPPO: iter([9.0, 4.0, 6.0, 30.0]),
         FastRecurrentPPO: iter([9.0, 2.0, 2.0, 5.0]),
@@ -102,7 +102,7 @@ def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
     config = HighTrainConfig(n_envs=4)
     spaces = tuple(gym.spaces.Box(-1.0, 1.0, (size,), np.float32) for size in (5, 13))
     result = bench.update_seconds(config, spaces, updates=3)
-    assert result == {"stock": 6.0, "fast": 2.0, "ratio": 3.0}  # turns of 2, 3 and 6 times
+    assert result == {"stock": 6.0, "fast": 2.0, "ratio": 3.0}  # ratios of 2, 3 and 6
 
 
 @pytest.mark.parametrize(

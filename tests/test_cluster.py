@@ -1,4 +1,4 @@
-"""Workers on several machines: a cluster of Ray with three nodes, all of them here."""
+"""Workers on several machines: a Ray cluster of three nodes, all on this machine."""
 
 import json
 import os
@@ -39,12 +39,14 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """This process's node, which simulates nothing, and two with two CPUs each; they run in a
-    folder where no relative path leads anywhere."""
+    """A Ray cluster: this process's node, which simulates nothing, and two with two CPUs each.
+
+    The nodes run in an empty folder, where no relative path resolves.
+    """
     patch = pytest.MonkeyPatch()
-    patch.setenv("PYTHONPATH", str(TESTS))  # where the tasks of the tests are
+    patch.setenv("PYTHONPATH", str(TESTS))  # so that workers can import the tests' tasks
     patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    patch.setenv("RAY_worker_niceness", "0")  # or other work would take all of the time
+    patch.setenv("RAY_worker_niceness", "0")  # otherwise other work would starve the nodes
     patch.delenv("RAY_ADDRESS", raising=False)
     with patch.context() as elsewhere:
         elsewhere.chdir(tmp_path_factory.mktemp("elsewhere"))
@@ -60,16 +62,16 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 @pytest.fixture
 def joined(nodes: Cluster) -> Cluster:
-    """The cluster, with two nodes to simulate, joined by this process."""
+    """The cluster with two nodes that simulate, joined by this process."""
     while len(nodes.worker_nodes) < 2:
         nodes.add_node(num_cpus=2)
-    while connect("auto") != 4:  # those lost before are still counted for some seconds
+    while connect("auto") != 4:  # lost nodes still count for some seconds
         time.sleep(0.1)
     return nodes
 
 
 def raylet(node: Any) -> int:
-    """Number of the process that all of a node's workers are children of."""
+    """Process id of a node's raylet, the parent of all its workers."""
     (info,) = node.all_processes["raylet"]
     return int(info.process.pid)
 
@@ -79,13 +81,13 @@ def parent(pid: int) -> int:
 
 
 def children(pid: int) -> dict[int, str]:
-    """A process's children and what they call themselves."""
+    """The children of a process: process id -> command line."""
     found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     return {int(p): Path(f"/proc/{p}/cmdline").read_text().strip("\0") for p in found}
 
 
 def lose(nodes: Cluster, node: Any) -> None:
-    """End all processes of a node at once, as when its power fails."""
+    """Kill all processes of a node at once, as when its power fails."""
     workers = children(raylet(node))
     nodes.remove_node(node, allow_graceful=False)
     for pid in workers:
@@ -94,7 +96,7 @@ def lose(nodes: Cluster, node: Any) -> None:
 
 
 def runs(pid: int) -> bool:
-    """Whether a process is there and no zombie, which waits for its parent to notice."""
+    """Whether a process exists and is not a zombie, which has ended but was not yet reaped."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -112,7 +114,7 @@ def wait_until_gone(pids: list[int]) -> None:
 def test_no_cluster(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One that is gone, none, no address, no Ray: a line each, and nothing is written."""
+    """A dead cluster, an unusable address and a missing Ray give one line; nothing is written."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         gone = f"127.0.0.1:{server.getsockname()[1]}"
     monkeypatch.setenv("RAY_ADDRESS", gone)
@@ -155,7 +157,10 @@ def test_a_node_with_another_version_is_refused(
 def test_a_run_in_a_cluster_is_the_run_on_this_machine(
     joined: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bit for bit, on the plane and on tiles, stopped in the middle of episodes and resumed."""
+    """Both end alike, bit for bit, on the plane and on tiles.
+
+    The run in the cluster is stopped in the middle of episodes and resumed.
+    """
     here, there = tmp_path / "here", tmp_path / "there"
     assert train_low.main([*TINY, "--out", str(here)]) == 0
 
@@ -171,7 +176,7 @@ def test_a_run_in_a_cluster_is_the_run_on_this_machine(
 
 
 def test_the_low_level_is_sent_along(joined: Cluster, tmp_path: Path) -> None:
-    """Its path means nothing on the nodes."""
+    """Its relative path does not resolve on the nodes; the run equals one on this machine."""
     arguments = [
         "--n-envs", "2", "--workers", "1", "--steps", "8", "--set", "ppo.n_steps=4",
         "--set", "ppo.minibatches=1", "--set", "ppo.n_epochs=1", "--set", "imitation.steps=0",
@@ -193,22 +198,22 @@ def test_more_workers_than_cpus(
 
 @pytest.fixture
 def fragile(joined: Cluster) -> Iterator[TaskVecEnv]:
-    """Eight robots in four workers, two on each node."""
+    """Eight robots in four workers, two workers on each node."""
     env = TaskVecEnv(Fragile, 8, 4, seed=3, spaces=SPACES, recover=True, link=ActorLink)
     yield env
     env.close()
 
 
 def test_workers_that_are_lost_are_started_elsewhere(joined: Cluster, fragile: TaskVecEnv) -> None:
-    """Those of one node at once, which is one fault, then others; the third one is raised."""
+    """Two workers lost with their node count as one fault; the third fault is raised."""
     env = fragile
     env.reset()
     first = env.worker_pids
     for pid in first:
-        os.kill(pid, signal.SIGINT)  # as a terminal does to all of its processes
+        os.kill(pid, signal.SIGINT)  # as Ctrl-C in a terminal does to all processes
     for _ in range(5):
         step(env, actions(8))
-    env.state_dicts()  # level 5 is what is known
+    env.state_dicts()  # the last known level is 5
     seen, *_ = step(env, actions(8))
     node = next(n for n in joined.worker_nodes if raylet(n) == parent(first[3]))
     lost = [k for k, pid in enumerate(first) if parent(pid) == raylet(node)]
@@ -296,7 +301,7 @@ def test_jobs_are_done_in_order_and_fail_as_they_do_here(
 def test_an_evaluation_that_loses_a_node_gives_the_same_table(
     joined: Cluster, tmp_path: Path
 ) -> None:
-    """Byte for byte, and the traces too."""
+    """Its result files and traces equal those of a run on this machine, byte for byte."""
     flags = [
         "--policies", "gp", "--families", "gap", "--levels", "8,9,10", "--episodes", "2",
         "--trace", "all",

@@ -19,7 +19,7 @@ def make(training: bool, command_start: float = 0.4) -> CommandDraw:
 
 
 def drawn(draw: CommandDraw, n: int) -> tuple[Array, Array]:
-    """Gaits and values of n free commands."""
+    """Draw n free commands; return their gaits and values."""
     return draw.draw(*draw.bounds(n), np.ones(n, dtype=bool))[:2]
 
 
@@ -32,7 +32,8 @@ def test_commands_fill_their_ranges() -> None:
     assert (values.max(axis=0) > bounds[:, 1] - 0.05 * width).all()
     standing = (values[:, :3] == 0.0).all(axis=1).mean()
     assert 0.05 < standing < 0.16
-    # 0.2, 0.2, 0.3 and 0.3 of the 19 in 20 that do not leap; the others pronk. Three deviations.
+    # Shares 0.2, 0.2, 0.3 and 0.3 of the 19 in 20 that do not leap; leaps add 30 pronks. The
+    # tolerance is three standard deviations.
     np.testing.assert_allclose(np.bincount(gaits, minlength=4), [114, 144, 171, 171], atol=36)
 
 
@@ -50,7 +51,10 @@ def test_leaps_are_fast_and_slow_in_step_and_free_commands_only() -> None:
 
 
 def test_strides_of_pronk_are_not_too_long() -> None:
-    """Those of other gaits are up to 0.6 m long. Slow robots still step slowly."""
+    """In pronk no stride is longer than 0.48 m, but slow robots still step slowly.
+
+    Other gaits have strides up to 0.6 m.
+    """
     gaits, values = drawn(make(training=False), 4000)
     frequency = values[:, INDEX["frequency"]]
     stride = np.hypot(values[:, 0], values[:, 1]) / frequency
@@ -79,14 +83,14 @@ def test_training_begins_with_a_share_of_the_velocity_ranges() -> None:
 
 
 def test_what_robots_fell_at_is_tried_again() -> None:
-    """By three of twenty free commands, once there is such a thing."""
+    """Three in twenty free commands repeat one at which a robot fell, once there are any."""
     draw = make(training=True)
     fallen = np.array([[-0.9, 0.1, 0.2, 0.0, 2.1, 0.45, 0.08, 0.1, 0.0, 0.25, 0.4, 0.001]] * 2)
     fallen[1, 0] = 0.7
     free = np.arange(2000) < 1500
     _, _, again = draw.draw(*draw.bounds(2000), free)
     assert not again.any()
-    for _ in range(200):  # the oldest are forgotten
+    for _ in range(200):  # the oldest are dropped
         draw.remember(np.concatenate([fallen, gait_embedding(np.array([0, 3]))], axis=1))
     gaits, values, again = draw.draw(*draw.bounds(2000), free)
     assert 0.12 < again[free].mean() < 0.18 and not again[~free].any()
@@ -97,7 +101,7 @@ def test_what_robots_fell_at_is_tried_again() -> None:
 
 
 def test_velocity_ranges_grow_for_a_gait_that_does_well() -> None:
-    """Of 4 robots each gait is judged by 200 samples."""
+    """With 4 robots, a gait is judged after 200 samples; if it does well, it gains 0.05."""
     draw, weights = make(training=True), CONFIG.rewards
     samples = np.array([1000.0, 0.0, 10.0, 1000.0])
     sums = {

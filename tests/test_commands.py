@@ -1,4 +1,4 @@
-"""The decoder: 13 actions to 15 commands, within bounds, and nothing else gets in."""
+"""The decoder: 13 actions to 15 commands within bounds, its inverse, and what it refuses."""
 
 import numpy as np
 import pytest
@@ -110,7 +110,7 @@ def test_the_nearest_command_that_can_be_decoded() -> None:
     assert gait_index(near).tolist() == [2, 0, 2]
     same = [j for j in range(12) if j not in (INDEX["vx"], INDEX["frequency"])]
     assert (near[:, same] == commands[:, same]).all()
-    actions = decoder.encode(near)  # in the middle where all actions mean the same
+    actions = decoder.encode(near)  # the middle, where all actions mean the same
     assert (actions[:, INDEX["frequency"]] == 0.0).all()
     np.testing.assert_allclose(decoder.decode(actions), near, atol=1e-12)
     inside = CommandDecoder().decode(np.random.default_rng(0).uniform(-1.0, 1.0, (9, 13)))
@@ -119,7 +119,7 @@ def test_the_nearest_command_that_can_be_decoded() -> None:
 
 @pytest.mark.parametrize("channel", range(12))
 def test_each_channel_maps_affinely_and_alone(channel: int) -> None:
-    """At -1, 0 and 1, while all others stay in the middle."""
+    """At -1, 0 and 1 it gives its bounds and middle; all others stay in the middle."""
     name, _, low, middle, high = CHANNELS[channel]
     actions = np.zeros((3, 13))
     actions[:, channel] = [-1.0, 0.0, 1.0]

@@ -61,7 +61,7 @@ def test_what_was_recorded_must_be_whole() -> None:
 
 
 def test_a_run_from_before_the_task_was_configured() -> None:
-    """Its numbers stood in the code; these are what they were, whatever the defaults are now."""
+    """Keys that did not exist then take the former constants, whatever the defaults are now."""
     data = to_dict(LowLevelConfig())
     for key in ("first_levels", "command_draw", "crossing"):
         del data[key]
@@ -213,7 +213,7 @@ def test_the_papers_preset_is_its_table() -> None:
     assert (ppo.gamma, ppo.gae_lambda) == (0.99, 0.95)
     assert (ppo.n_steps, ppo.n_epochs, ppo.minibatches) == (24, 5, 4)
     assert (ppo.lstm, ppo.actor, ppo.critic) == (128, (128,), (128,))
-    # Its robots are told the family, on the paper's five, and keep their memories.
+    # Robots are always told the family, one of the paper's five, and keep their hidden states.
     assert (config.env.unknown_share, ppo.memory_exchange) == (0.0, 0.0)
     assert config.env.families == ("rough", "pillar", "stair", "gap", "tilt")
     assert with_overrides(HighTrainConfig(), PRESETS["default"]) == HighTrainConfig()

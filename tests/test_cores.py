@@ -1,4 +1,4 @@
-"""How many cores there are, within the quotas of control groups, and workers for them."""
+"""Cores that a process may use, within control group quotas, and the workers for them."""
 
 import argparse
 import os
@@ -23,7 +23,7 @@ def test_workers_flag() -> None:
         workers_flag("all")
 
 
-#: Files -> cores of a machine with 16 that the process may use.
+#: Name -> files (path -> content), and how many cores of 16 the process may use.
 SYSTEMS: dict[str, tuple[dict[str, str], int]] = {
     "no control groups": ({}, 16),
     "version 2, no quota": (

@@ -1,4 +1,4 @@
-"""The scripted law on the cues: what it remembers is right, and it gets to the goal by it."""
+"""``CuesLaw``, the scripted law on the cues: its memory is right, and robots reach their goals."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def goal_cue(position: Array, heading: Array, goal: Array) -> tuple[Array, Array
 
 
 def test_one_of_two_tracks_is_where_the_robot_is() -> None:
-    """Robots that weave and sidestep to goals on either side, 0.1 s a decision."""
+    """Robots weave and sidestep to a goal on the left and one on the right, 0.1 s per decision."""
     goal = np.array([[GOAL_X, 1.5], [GOAL_X, -0.8]])
     position, heading = np.array([[START_X, 0.0]] * 2), np.array([0.4, -0.3])
     where = Reckoning(*goal_cue(position, heading, goal))
@@ -46,14 +46,14 @@ def test_one_of_two_tracks_is_where_the_robot_is() -> None:
         )
         position, heading = position + 0.1 * world, wrap_angle(heading + 0.1 * turn)
         where.move(*goal_cue(position, heading, goal), velocity, 0.1)
-    for robot, track in ((0, 0), (1, 1)):  # the goal to the left, and to the right
+    for robot, track in ((0, 0), (1, 1)):  # the goal is to the left, or to the right
         assert where.heading[track, robot] == pytest.approx(heading[robot], abs=0.05)
         wanted = position[robot] - [0.0, goal[robot, 1]]
         assert where.position[track, robot] == pytest.approx(wanted, abs=0.1)
 
 
 def test_lips_and_track_come_from_what_was_probed() -> None:
-    """A robot walks along track 1, its heading off by 0.3 rad on the other."""
+    """A robot walks along track 1; on track 0 its heading is off by 0.3 rad."""
     trenches = np.array([[2.12, 2.41], [3.3, 3.55]])
     profile, ahead = Profile(1), POINTS[:, 1] == 0.0
     x, y = POINTS.T
@@ -98,7 +98,7 @@ def test_the_way_leads_around_what_was_seen() -> None:
 
 
 class Watched(CuesLaw):
-    """The law, whose memory can be looked at."""
+    """The law, with its memory exposed."""
 
     memory: LawMemory
 
@@ -124,7 +124,7 @@ def run(law: CuesLaw, condition: str, family: str, level: int, count: int) -> li
 def test_lips_are_where_probes_met_them(
     law: Watched, condition: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Noisy probes are late, too: by 12 cm at the speed of a leap."""
+    """The lips are right within 6 cm, though noisy probes are also 12 cm late at leaping speed."""
     monkeypatch.setattr(evaluation, "HORIZON", 1.2)
     run(law, condition, "gap", 4, 4)
     track = law.memory.profile.track()
@@ -134,7 +134,10 @@ def test_lips_are_where_probes_met_them(
 
 
 def test_leaps_are_timed_by_the_gait_clock(law: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cue has its phases warped by the duty factor: by 0.05 of a cycle in leaps, 2 cm."""
+    """The law undoes the warp of the cue's phases by the duty factor.
+
+    In leaps, the warp is 0.05 of a cycle or 2 cm.
+    """
     driver = HierarchyDriver(law, HighLevelConfig(commands=CONFIG.commands))
     off, plan_steps = [], LeapPlan.steps
 

@@ -47,7 +47,7 @@ def test_smallest_thresholds_never_overlap(window, threshold):
 
 
 def play(curriculum: Curriculum, outcomes: str) -> list[int]:
-    """Levels of environment 0 after each episode of a string of 1 (reached) and 0 (not)."""
+    """Levels of environment 0 after each episode; ``outcomes`` has 1 for success, 0 for failure."""
     levels = []
     for outcome in outcomes:
         curriculum.push([0], [outcome == "1"])
@@ -57,10 +57,10 @@ def play(curriculum: Curriculum, outcomes: str) -> list[int]:
 
 def test_nothing_moves_before_the_window_is_full_and_it_empties_after_a_change():
     curriculum = Curriculum(1, 4, 3, LEVELS)
-    # promoted by the 4th episode, then by the 8th: the first four do not count again
+    # promoted by the 4th episode, then by the 8th: the first four count only once
     assert play(curriculum, "11111111111") == [0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
     assert curriculum.counts.tolist() == [3]
-    # failures 1 0 0 0 -> one success, below W - S + 1 = 2
+    # 1000 has one success, below W - S + 1 = 2, and demotes
     curriculum = Curriculum(1, 4, 3, LEVELS, start=5)
     assert play(curriculum, "10000000") == [5, 5, 5, 4, 4, 4, 4, 3]
     assert curriculum.counts.tolist() == [0] and not curriculum.outcomes.any()
@@ -165,7 +165,7 @@ def test_resume_is_exact():
     first, second = Curriculum(8, 5, 4, LEVELS), Curriculum(8, 5, 4, LEVELS)
     run(first, episodes[:33])
     state = first.state_dict()
-    run(first, episodes[33:])  # the state is a copy: going on must not change it
+    run(first, episodes[33:])  # the state is a copy: further episodes must not change it
     second.load_state_dict(state)
     run(second, episodes[33:])
     assert through.levels.tolist() == second.levels.tolist() == first.levels.tolist()

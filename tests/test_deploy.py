@@ -1,4 +1,4 @@
-"""An exported folder says all that a program needs, and the controller does what it says."""
+"""An exported folder holds all that a program needs, and the controller does what it says."""
 
 import copy
 import csv
@@ -22,12 +22,12 @@ from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import RobotState
 from tdgc.tasks.pairing import PRETRAINED
 
-FORM = "torchscript"  # written in a tenth of the time
+FORM = "torchscript"  # takes a tenth of the time to write
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shipped pair."""
+    """Export of the shipped pair."""
     path = tmp_path_factory.mktemp("export")
     export.write(export.load_pair(PRETRAINED / "low", PRETRAINED / "high"), path, [FORM])
     return path
@@ -39,7 +39,7 @@ def controller(folder: Path) -> Controller:
 
 
 def state(controller: Controller, **values: Any) -> RobotState:
-    """One robot at the origin, standing."""
+    """State of one upright robot 0.3 m above the origin, with ``values`` set."""
     made = RobotState.zeros(read_geometry(controller.robot()), 1)
     made.position[0, 2] = 0.3
     for name, value in values.items():
@@ -56,7 +56,7 @@ def level(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where the fields of an interface are; what the policy's file says is for people."""
+    """Yield the paths of an interface's fields, except inside ``policy``, which is for people."""
     if path == ("policy",):
         return
     if isinstance(value, dict):
@@ -80,7 +80,7 @@ def test_the_schema_is_one_and_the_files_keep_to_it(folder: Path) -> None:
 @pytest.mark.parametrize("name", GRAPHS)
 def test_each_missing_field_is_refused_in_one_line(folder: Path, tmp_path: Path, name: str) -> None:
     whole = json.loads((folder / f"{name}_interface.json").read_text())
-    # Names of links are the robot's, and which formats there are was chosen.
+    # Neither the names of the links nor the choice of formats is prescribed.
     free = (("robot", "link_masses", "value"), ("files",))
     fields = [path for path in places(whole) if path[:-1] not in free]
     assert len(fields) > 150
@@ -194,7 +194,7 @@ def test_it_stands_after_the_goal_and_after_the_horizon(controller: Controller) 
     at, away = (controller.sense(robot, np.array([x, 0.0]), "rough", level) for x in (0.4, 5.0))
     for step in range(120):
         controller.step(at if step == 15 else away)
-        standing = step >= 15 + 100  # 2 s, as it was trained to go on
+        standing = step >= 15 + 100  # 2 s, as it was trained to keep deciding
         assert controller.decided == (step % 5 == 0 and not standing)
         assert np.array_equal(controller.commands, stand) == standing
     controller.reset()
@@ -232,7 +232,7 @@ def test_a_graph_that_is_not_the_exports_is_refused(folder: Path, tmp_path: Path
 
 @pytest.fixture(scope="module")
 def walk(controller: Controller, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of eleven steps of a robot that stays where it is, on ground that rises."""
+    """Log of eleven steps of a robot that stays in place on rising ground."""
     robot, writer = state(controller), LogWriter(controller)
     controller.reset()
     readings = controller.sense(robot, np.array([5.0, 1.0]), "stair", lambda x, y: 0.1 * x)
@@ -246,7 +246,7 @@ def walk(controller: Controller, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def columns(log: Path) -> dict[str, list[str]]:
-    """The columns of a log as a CSV file has them, in order."""
+    """Columns of a log in order, by name, as in a CSV file."""
     table = dict(np.load(log))
     entries = {"time": table.pop("time")}
     entries |= {f"{n}_{k}": x[:, k] for n, x in table.items() for k in range(x.shape[1])}
@@ -260,18 +260,18 @@ def write_csv(path: Path, head: list[str], entries: list[list[str]]) -> Path:
 
 
 def test_columns_go_by_their_numbers(controller: Controller, walk: Path, tmp_path: Path) -> None:
-    """As a table that sorts its names has them: probes_0, probes_1, probes_10, probes_11."""
+    """Columns may be in any order, such as sorted: probes_0, probes_1, probes_10, probes_11."""
     entries = columns(walk)
     names = sorted(entries)
     assert names.index("probes_10") < names.index("probes_2")
     wanted = log.read(walk, controller)
-    entries["motor_3"] = ["1"] * 12  # what else is logged does not matter
+    entries["motor_3"] = ["1"] * 12  # other columns are ignored
     for order in ([*names, "motor_3"], names[::-1]):
         path = write_csv(tmp_path / "walk.csv", order, [entries[name] for name in order])
         found = log.read(path, controller)
         for name, values in wanted.values.items():
             assert np.array_equal(found.values[name], values, equal_nan=True), name
-    assert len(np.unique(wanted.values["probes"][0])) > 20  # so that an order shows
+    assert len(np.unique(wanted.values["probes"][0])) > 20  # so a wrong order would show
 
 
 @pytest.mark.parametrize(
@@ -279,8 +279,8 @@ def test_columns_go_by_their_numbers(controller: Controller, walk: Path, tmp_pat
     [
         ("probes_7", "probes_32", "no column 'probes_7', but 'probes_32'"),
         ("family_0", "family_6", "no column 'family_0', but 'family_6'"),
-        ("gravity_1", "gravity_2", "the column 'gravity_2' stands twice"),
-        ("gravity_1", "gravity_02", "the column 'gravity_2' stands twice"),
+        ("gravity_1", "gravity_2", "the column 'gravity_2' appears twice"),
+        ("gravity_1", "gravity_02", "the column 'gravity_2' appears twice"),
         ("gravity_2", "gravitas", "'gravity' must be numbers (12, 3), not (12, 2)"),
     ],
 )
@@ -296,7 +296,7 @@ def test_columns_with_gaps_or_twice_are_refused(
 
 
 def damaged(walk: Path, out: Path, kind: str) -> Path:
-    """A copy of a log that a full disk, a bad cable or a wrong tool has spoilt."""
+    """Write a copy of a log as damaged by a full disk, a bad cable or the wrong tool."""
     data = walk.read_bytes()
     path = out / f"bad.{'csv' if 'CSV' in kind else 'npz'}"
     if kind == "truncated":

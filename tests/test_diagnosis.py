@@ -1,4 +1,4 @@
-"""Diagnosis: planted faults are blamed on their layer; each rule; the summary's numbers."""
+"""Diagnosis: planted faults are blamed on the right layer; each rule; the summary's numbers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tdgc.benchmark.trace import COLUMNS, Trace, Tracer
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import NUM_PROBES
 
-HIPS = 0.183  # m, of the shipped robot
+HIPS = 0.183  # m ahead of the trunk's centre, of the shipped robot
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def pair(low):
 
 
 def blamed(driver: HierarchyDriver, low: Any, cells: list[tuple[str, int, int]]) -> list[str]:
-    """The layers that are blamed for the failures of (family, level, episodes)."""
+    """Layers blamed for the failures in ``cells``: (family, level, number of episodes)."""
     return [
         layer
         for family, level, count in cells
@@ -70,12 +70,12 @@ def test_a_blindfold_is_the_decisions_fault(low, pair):
 
 
 def test_limits_are_measured_where_nothing_is_wrong():
-    """Of 20 episodes one has 0.5 m/s of error in one of its three stretches, all others 0.1."""
+    """One of 60 stretches, three per episode, has an error of 0.5 m/s; all others have 0.1."""
     traces = [walk(outcome="reached", seconds=7.0, error_vx=0.1) for _ in range(20)]
     traces[-1]["error_vx"][-20:] = 0.5
     velocity, turn = (measured_limits(traces, HIPS)[name] for name in ("velocity", "yaw rate"))
     assert turn == (0.0, 0.0)
-    assert velocity[0] == pytest.approx(0.1)  # a stretch of 60 is rarer than one of 20
+    assert velocity[0] == pytest.approx(0.1)  # 1 of 60 stretches is less than 5 %
     errors = [*[0.1] * 19, 0.1 + 0.4 * 20 / 60]
     assert velocity[1] == pytest.approx(np.percentile(errors, 95), abs=1e-6)
 
@@ -125,7 +125,7 @@ def walk(
 ) -> Trace:
     """A trace of a straight walk from one end of ``track`` to the other, with constant columns.
 
-    Not given, the goal lies straight ahead and every command is tracked.
+    By default the goal lies straight ahead and every command is tracked exactly.
     """
     n = round(10 * seconds) + 1
     way = np.linspace(0.0, 1.0, n)
@@ -156,7 +156,7 @@ def test_errors_beyond_the_limits_are_the_executions_fault():
     limit = LIMITS["velocity"].stretch
     assert verdict(walk(error_vx=-limit - 0.01)) == ("execution", "lost track of velocity")
     assert verdict(walk(error_vx=-limit + 0.01)) == ("decisions", "steered off the tile")
-    assert verdict(walk(error_vx=0.8 * limit, error_vy=0.8 * limit))[0] == "execution"  # a vector
+    assert verdict(walk(error_vx=0.8 * limit, error_vy=0.8 * limit))[0] == "execution"  # the norm
     limit = LIMITS["yaw rate"].stretch
     assert verdict(walk(error_yaw_rate=limit + 0.01)) == ("execution", "lost track of yaw rate")
     both = walk(error_pitch=LIMITS["tilt"].stretch + 0.01, error_yaw_rate=-limit - 0.01)
@@ -186,7 +186,7 @@ def test_speeding_up_from_rest_does_not_count():
 def test_a_fall_is_the_executions_fault_unless_the_command_led_elsewhere():
     on_the_way = ("execution", "lost its footing on the way to the goal")
     elsewhere = ("decisions", "lost its footing on the way elsewhere")
-    for outcome in ("fell", "collided"):  # the trunk hits a step just as it hits the ground
+    for outcome in ("fell", "collided"):  # a trunk that hits a step has fallen, too
         assert verdict(walk("stair", outcome=outcome)) == on_the_way
         assert verdict(walk("stair", outcome=outcome, goal_bearing=1.8)) == elsewhere
         assert verdict(walk("stair", outcome=outcome, command_vx=-0.19)) == elsewhere
@@ -203,7 +203,7 @@ def test_who_leads_away_from_the_goal_is_not_judged_by_tracking():
 
 
 def test_who_walks_blindly_into_a_trench_made_no_decision():
-    """Where nothing looked at the ground; whoever has seen the trench is judged as elsewhere."""
+    """This takes a trace without any terrain cue; with cues, the usual rules apply."""
     lip = float(tile_of(0, "gap", 6, 0).features.trenches[0, 0])
     at_lip = ((lip - 1.5, 4.0), (lip - HIPS, 4.0))
     blind = {f"probe_{i:02d}": np.nan for i in range(NUM_PROBES)}
@@ -231,15 +231,15 @@ def test_the_baseline_is_not_blamed_on_the_low_level_in_gap(low):
 def test_a_pillar_in_the_way_is_the_decisions_fault():
     pillars = tile_of(0, "pillar", 6, 0).features.pillars
     px, y, diameter = (float(v) for v in pillars[pillars[:, 0].argmin()])
-    x = px - 0.5 * diameter  # where the first of them begins
+    x = px - 0.5 * diameter  # near edge of the first pillar
     into = ((x - 1.0, y), (x - 0.25, y))
     hit = diagnose(walk("pillar", outcome="collided", track=into), HIPS)
     assert (hit.layer, hit.cause) == ("decisions", "steered into a pillar")
     assert hit.feature == f"0.25 m from pillar at ({px:.1f}, {y:.1f}) m"
-    # Pushing against it, the robot tracks nothing; that tells nothing of the low policy.
+    # A robot that pushes against it tracks no command, which is not the low policy's fault.
     pushing = walk("pillar", outcome="timeout", track=((x - 0.3, y), (x - 0.3, y)), error_vx=-0.5)
     assert verdict(pushing) == ("decisions", "held up by a pillar")
-    # On the same tile, away from all pillars, it does.
+    # Away from all pillars on the same tile, it is the low policy's fault.
     away = walk("pillar", outcome="timeout", track=((0.8, 4.0), (1.0, 4.0)), error_vx=-0.5)
     assert verdict(away) == ("execution", "lost track of velocity")
 
@@ -288,7 +288,7 @@ def test_places_along_the_tile():
 def test_features_are_where_the_tile_has_them(family):
     tile = tile_of(0, family, 8, 0)
     heights = tile.heights[:, 80]
-    if family == "gap":  # a trench is as long as what is lowered
+    if family == "gap":  # trenches are where the ground is lowered
         lowered = 0.05 * np.flatnonzero(heights < -0.3)
         starts = lowered[np.diff(lowered, prepend=-1.0) > 0.1]
         for k, x in enumerate(starts):
@@ -296,7 +296,7 @@ def test_features_are_where_the_tile_has_them(family):
             assert name == f"trench {k + 1} of {len(starts)}" and distance == 0.0
             ((_, distance),) = features(tile, float(x) - 0.3, 4.0)
             assert distance == pytest.approx(0.3, abs=0.05)
-    else:  # a step is a cell in which the ground rises or sinks
+    else:  # steps are cells in which the height changes
         steps = 0.05 * np.flatnonzero(np.abs(np.diff(heights)) > 0.01)
         assert len(steps) >= 10
         for k, x in enumerate(steps):

@@ -1,4 +1,4 @@
-"""Who decides on commands: the baseline's law, the hierarchy as it was trained, refusals."""
+"""Drivers: the baseline's law, the hierarchy as in training, and pairs that are refused."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def save_high(
     meta: dict[str, Any] | None = None,
     hidden: int | None = 8,
 ) -> Path:
-    """A small high policy with random weights that walks about: gaits and commands vary."""
+    """Save a small high policy with random weights; as it walks, gaits and commands vary."""
     size = size or width(high_layout(config))
     policy = FastRecurrentPolicy(
         spaces.Box(-np.inf, np.inf, (size,)),
@@ -74,7 +74,7 @@ def save_high(
                 noise = th.randn(parameter.shape, generator=generator)
                 parameter.copy_(noise / parameter.shape[-1] ** 0.5)
         if hidden is not None:
-            policy.lstm_actor.weight_ih_l0.mul_(8.0)  # quick to change its mind
+            policy.lstm_actor.weight_ih_l0.mul_(8.0)  # so that decisions change quickly
         policy.action_net.weight[:-1].mul_(0.5)
         policy.action_net.weight[-1].mul_(4.0)
         policy.action_net.bias.copy_(th.from_numpy(CommandDecoder().encode(walk)))
@@ -121,7 +121,7 @@ def test_baseline_holds_the_default_behaviour_parameters(low):
 
 
 def test_baseline_keeps_to_the_ranges_that_it_is_given(low):
-    """Narrower than what its law asks for at a goal straight ahead and at one behind."""
+    """They are narrower than what its law asks for with a goal straight ahead and one behind."""
     narrow = dataclasses.replace(
         CommandRanges(),
         vx=(-0.3, 0.3),
@@ -153,7 +153,7 @@ def test_baseline_keeps_to_the_ranges_that_it_is_given(low):
 
 @pytest.mark.parametrize("family", ["gap", "stair"])
 def test_the_teacher_drives_as_it_teaches(low, family):
-    """Its commands are those that the apprentice is shown, held for a decision."""
+    """Its commands are those that the student is shown, held for a decision."""
     config, landing = dataclasses.replace(CONFIG, families=(family,)), measure_landing(*low)
     task = NavigationTask(config, LOW, 2, seed=4, training=False, taught=True, landing=landing)
     try:
@@ -175,7 +175,7 @@ def test_the_teacher_drives_as_it_teaches(low, family):
 
 @pytest.mark.parametrize("hidden", [8, None], ids=["recurrent", "feed-forward"])
 def test_hierarchy_decides_in_the_evaluation_as_in_its_environment(low, tmp_path, hidden):
-    """Observation, LSTM state, last action and clock of the environment, decision by decision."""
+    """Its commands, and so its observation, hidden state, last action and clock, are the same."""
     gaits = ("trot", "pace", "bound") if hidden is None else CONFIG.gaits
     config = dataclasses.replace(CONFIG, families=("gap",), gaits=gaits)
     high, loaded = load_high(save_high(tmp_path / "high", low, config, hidden=hidden), *low)
@@ -193,8 +193,8 @@ def test_hierarchy_decides_in_the_evaluation_as_in_its_environment(low, tmp_path
                 assert np.array_equal(command, task.decoder.decode(action))
             seen.append(command)
             task.step(action)
-        assert (np.ptp(seen, axis=0).max(axis=0)[:3] > 1e-3).all()  # it does react
-        # New episodes: nothing of the old ones is left in the state.
+        assert (np.ptp(seen, axis=0).max(axis=0)[:3] > 1e-3).all()  # the policy reacts
+        # New episodes begin with a fresh hidden state.
         task.reset(np.arange(2))
         first, _ = high.predict(task.observe())
         driver.begin(task.locomotion, task.goal, "gap")
@@ -281,7 +281,7 @@ def test_files_that_are_no_high_level_are_refused(low, tmp_path):
     with pytest.raises(ConfigError, match=r"low: not a high policy of this package$"):
         load_high(LOW, *low)
     path = save_high(tmp_path / "high", low, meta={"low": None})
-    with pytest.raises(ConfigError, match=r"high: its meta lacks what it was trained on$"):
+    with pytest.raises(ConfigError, match=r"high: its metadata do not say what it was trained on$"):
         load_high(path, *low)
     path = save_high(tmp_path / "high", low, size=80)
     with pytest.raises(ConfigError, match=r"high policy that observes 92 values, not 80$"):

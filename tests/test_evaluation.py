@@ -1,4 +1,4 @@
-"""The protocol: outcomes, intervals, paired tiles, repeatability, the script's table."""
+"""The protocol: cells, conditions, paired tiles, repeatability, and the script's table."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def high(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def table(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of the script with the default policies, on two processes."""
+    """Results of the script with the default policies and two processes."""
     out = tmp_path_factory.mktemp("table")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluate, "SHIPPED_HIGH", high)
@@ -61,7 +61,7 @@ def table(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-#: Robots fall into the first trench within seconds.
+#: Flags of a short evaluation: robots fall into the first trench within seconds.
 SMALL = ["--levels", "10", "--families", "gap", "--episodes", "2", "--seed", "3"]
 
 
@@ -135,7 +135,7 @@ def test_pushes_have_their_size_and_are_paired():
 
 
 class Watcher(BaselineDriver):
-    """A baseline that notes what it was given."""
+    """A baseline that keeps the terrain, the goals and the poses it begins with."""
 
     def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
         super().begin(loco, goal, *told)
@@ -172,11 +172,11 @@ def test_an_episode_alone_and_twice(low, monkeypatch):
         assert a.track[0] == pytest.approx(tile.start, abs=1e-6)
         assert a.goal == pytest.approx(tile.goal)
         direct = np.linalg.norm(np.diff(a.track[:, :2], axis=0), axis=1).sum()
-        assert 0.1 < direct <= a.path_m + 1e-9  # its way is longer than its chords
+        assert 0.1 < direct <= a.path_m + 1e-9  # the path is longer than its chords
 
 
 class Told(BaselineDriver):
-    """A baseline that notes the robots' clocks, what it is told and their joint targets."""
+    """A baseline that keeps the robots, their clocks at the start and what it is told."""
 
     def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
         super().begin(loco, goal, *told)
@@ -184,7 +184,7 @@ class Told(BaselineDriver):
 
 
 def test_noise_follows_from_the_episode(low, monkeypatch):
-    """Clock, sensors and probes of an episode are the same alone, in a batch, for any policy."""
+    """An episode's clock, sensors and probes are the same alone, in a batch, for any policy."""
     monkeypatch.setattr(evaluation, "HORIZON", 0.1)
     runs = {}
     for key, policy, condition, first, count in (
@@ -200,10 +200,10 @@ def test_noise_follows_from_the_episode(low, monkeypatch):
         runs[key] = (driver.clock, driver.loco.targets[0], probes)
     for mine, same, alone in zip(runs["batch"], runs["other policy"], runs["alone"], strict=True):
         assert np.array_equal(mine, same)
-        assert mine[1:2] == pytest.approx(alone, abs=1e-5)  # another size of batch rounds otherwise
+        assert mine[1:2] == pytest.approx(alone, abs=1e-5)  # other batch sizes round differently
     assert len(set(runs["batch"][0])) == 3 and (runs["exact"][0] == 0.0).all()
     assert runs["exact"][2] is None
-    # Noise of 0.01 rad in the joints is seen in their targets.
+    # Noise of 0.01 rad in the joint angles shows in the joint targets.
     assert np.abs(runs["batch"][1] - runs["exact"][1]).max() > 0.01
 
 
@@ -222,7 +222,7 @@ def test_without_a_family_it_is_unknown(low, monkeypatch):
 
 
 def test_a_mirrored_tile_is_walked_in_mirror_image(low, monkeypatch):
-    """Bullet's triangles and solver are not symmetric, so only nearly so."""
+    """Agreement is to 0.03 m and rad, because Bullet's triangles and solver are not symmetric."""
     monkeypatch.setattr(evaluation, "HORIZON", 1.0)
     tracks = [
         run_cell(Cell("gp", condition, "tilt", 6, 3, 1), low, BaselineDriver(), seed=5)[0].track
@@ -235,7 +235,7 @@ def test_a_mirrored_tile_is_walked_in_mirror_image(low, monkeypatch):
 
 
 class Recorder(HierarchyDriver):
-    """A hierarchy that notes what it commanded."""
+    """A hierarchy that keeps its commands."""
 
     def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
         super().begin(loco, goal, *told)
@@ -298,7 +298,7 @@ def test_results_have_a_row_and_a_track_an_episode(table):
 
 
 def test_the_table_does_not_depend_on_the_processes(table, low, high, tmp_path):
-    """Two cells on two processes, both on one, and one of them here, where others ran before."""
+    """Two processes and one give the same rows; so does a cell run in this one, after others."""
     flags = ["--policies", "tdgc,gp", "--high", str(high), "--workers", "1"]
     assert evaluate.main([*SMALL, *flags, "--out", str(tmp_path)]) == 0
     for name in ("episodes.csv", "summary.json"):
@@ -373,7 +373,7 @@ def test_a_policy_of_the_wrong_kind(high, capsys):
 
 
 def test_an_evaluation_checks_itself():
-    """What flags cannot ask for cannot be made otherwise."""
+    """``Evaluation`` itself refuses what the flags refuse."""
     whole = evaluate.Evaluation.of(evaluate.parse(["--policies", "gp", "--workers", "1"]))
     assert (whole.mode, whole.levels, whole.policies) == ("table", (6, 7, 8, 9, 10), ("gp",))
     for change, message in (
@@ -415,7 +415,7 @@ RunJobs = Callable[[Callable[[Any], Any], Sequence[Any], int], Iterator[Any]]
 
 
 def stopped(after: int, error: BaseException) -> RunJobs:
-    """What shares jobs until ``error`` comes after some of them."""
+    """A ``run_jobs`` that does the first ``after`` jobs and then raises ``error``."""
 
     def run_jobs(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:
         yield from map(work, jobs[:after])
@@ -432,9 +432,9 @@ def answer(flags: list[str]) -> int | str | None:
         return end.code
 
 
-#: Two policies, two cells each, of two batches of an episode each.
+#: Flags of two policies with two cells each; with ``BATCH`` 1, a cell is two batches.
 FOUR = ["--levels", "9,10", "--families", "gap", "--episodes", "2", "--workers", "1"]
-DIED = "a process died, perhaps for want of memory"
+DIED = "a process died, perhaps out of memory"
 BLOWN = "Cell(...): a robot's position is not finite"
 
 
@@ -449,7 +449,7 @@ BLOWN = "Cell(...): a robot's position is not finite"
     ],
 )
 def test_what_is_complete_is_kept(error, reason, high, tmp_path, monkeypatch, capsys):
-    """Stopped before the last batch: of the last cell half is missing."""
+    """Stopped before the last batch, an evaluation drops only the last cell, which lacks half."""
     monkeypatch.setattr(evaluation, "BATCH", 1)
     monkeypatch.setattr(evaluation, "HORIZON", 0.04)
     monkeypatch.setattr(evaluate, "run_jobs", stopped(7, error))
@@ -463,14 +463,14 @@ def test_what_is_complete_is_kept(error, reason, high, tmp_path, monkeypatch, ca
         ("gp", "9", "0"), ("gp", "9", "1"),
     ]  # fmt: skip
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    assert list(summary) == ["tdgc", "gp", "editions"]  # on other tiles: not compared
+    assert list(summary) == ["tdgc", "gp", "editions"]  # not paired: different tiles
     assert summary["gp"]["nominal"]["mean"]["n"] == 2 and "gp, nominal" in said.out
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"episodes.csv", "summary.json", "trajectories.npz"}
 
 
 def test_without_a_complete_cell_there_is_no_table(tmp_path, monkeypatch, capsys):
-    """Nor is there what an earlier evaluation left."""
+    """The files of an earlier evaluation are removed as well."""
     old = ["episodes.csv", "summary.json", "trajectories.npz", "report.html", "diagnosis.csv"]
     old += ["success.png", "gaits.png", "headings.png", "trajectories.png", "notes.txt"]
     for name in old:
@@ -485,7 +485,7 @@ def test_without_a_complete_cell_there_is_no_table(tmp_path, monkeypatch, capsys
 
 
 def test_ctrl_c_stops_what_called_the_script_too(tmp_path, monkeypatch):
-    """The ablation would go on with its next trial."""
+    """The script raises ``SystemExit``; after a status the ablation would run its next trial."""
     monkeypatch.setattr(evaluate, "run_jobs", stopped(0, KeyboardInterrupt()))
     with pytest.raises(SystemExit):
         evaluate.main([*FOUR, "--policies", "gp", "--out", str(tmp_path)])

@@ -19,7 +19,7 @@ LOW, CONFIG = load_low(PRETRAINED / "low")
 
 @pytest.fixture
 def robots() -> Iterator[list[Locomotion]]:
-    """Three times three robots that stand alike."""
+    """Three worlds of three robots each, which all stand in the same pose."""
     made = [Locomotion(3, CONFIG.robot, CONFIG.physics, None, CONFIG.gyro) for _ in range(3)]
     for loco in made:
         xy = np.array([[0.0, 0.0], [0.0, 3.0], [0.0, 6.0]])
@@ -47,7 +47,7 @@ def test_a_step_is_observation_policy_and_action(robots: list[Locomotion]) -> No
 
 
 def test_noise_is_drawn_where_it_is_given(robots: list[Locomotion]) -> None:
-    """And follows from the draws of each robot, whoever is beside it."""
+    """Noise is drawn only if given, and depends on a robot's own draws, not on its neighbours."""
     exact, noisy, again = robots
     noise = RandomisationConfig()
     seeds = [(7, k) for k in range(3)]

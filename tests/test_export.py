@@ -1,4 +1,4 @@
-"""Exported policies: each graph is the simulator's own step, and a robot needs nothing else."""
+"""Exported policies: each graph computes the simulator's step, and a robot needs nothing else."""
 
 import dataclasses
 import json
@@ -48,7 +48,7 @@ def unbounded(size: int) -> spaces.Box:
 
 
 def shake(policy: ActorCriticPolicy) -> None:
-    """Random parameters that give actions within and beyond their bounds."""
+    """Set random parameters that give actions within and beyond their bounds."""
     generator = th.Generator().manual_seed(0)
     with th.no_grad():
         for parameter in policy.parameters():
@@ -63,7 +63,7 @@ def random_high(
     hidden: int | None = 32,
     encoder: tuple[int, ...] = (),
 ) -> Path:
-    """A high policy with random weights, saved as ``train_high.py`` saves one."""
+    """Save a high policy with random weights as ``train_high.py`` does; return its path."""
     size = width(high_layout(config))
     limit = config.action_limit
     mirror = high_mirror(config) if config.probes == "lines" else None
@@ -98,7 +98,7 @@ def random_commands(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def disturb(loco: Locomotion, rng: np.random.Generator) -> None:
-    """Any state a robot could be in, and more."""
+    """Put the robots into random states, including ones that no robot could be in."""
     state, m = loco.world.state, loco.num_robots
     state.position[:] = rng.uniform(0.5, 3.0, (m, 3))
     turn = rng.normal(size=(m, 4))
@@ -113,7 +113,7 @@ def disturb(loco: Locomotion, rng: np.random.Generator) -> None:
 
 
 def body(loco: Locomotion, k: int) -> dict[str, np.ndarray]:
-    """What the sensors of robot ``k`` say."""
+    """Sensor readings of robot ``k``."""
     state = loco.world.state
     return {
         "gravity": state.gravity[k],
@@ -124,7 +124,7 @@ def body(loco: Locomotion, k: int) -> dict[str, np.ndarray]:
 
 
 def run(graph: LowGraph | HighGraph, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Outputs by name of a graph before its export."""
+    """Run a graph before its export; return its outputs by name."""
     inputs = [th.as_tensor(values[s.name], dtype=th.float64) for s in graph.inputs]
     assert [tuple(x.shape) for x in inputs] == [(s.size,) for s in graph.inputs]
     outputs = graph(*inputs)
@@ -141,7 +141,7 @@ def high(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both levels in all formats: the shipped low policy and a random high policy."""
+    """Export of the shipped low policy and a random high policy in all formats."""
     path = tmp_path_factory.mktemp("export")
     export.write(export.load_pair(LOW, high), path, list(FORMATS))
     return path
@@ -149,7 +149,7 @@ def folder(high: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A high policy of episodes of a second, and the pair beside it as TorchScript."""
+    """A high policy with episodes of one second, and beside it the pair as TorchScript."""
     path = tmp_path_factory.mktemp("short")
     config = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
     pair = export.load_pair(LOW, random_high(path / "policy", config))
@@ -159,7 +159,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Undo what a script's main does to the process."""
+    """Restore the number of threads, which a script's main changes."""
     threads = th.get_num_threads()
     yield
     th.set_num_threads(threads)
@@ -193,9 +193,10 @@ def test_low_level_is_the_executors_step(
         disturb(loco, rng)
         before = loco.command.copy()
         loco.clock.update(before[:, 12:], before[:, 5])
-        cycles = rng.uniform(0.1, 3.0, m)  # swing grows over the first, two are hurried
+        # Swing grows over the first cycle of a gait; the first two may be faster than commanded.
+        cycles = rng.uniform(0.1, 3.0, m)
         loco.clock.cycles = cycles.copy()
-        loco.command[:6] = random_commands(rng, 7)[1:]  # other gaits than before
+        loco.command[:6] = random_commands(rng, 7)[1:]  # their gait changes
         loco.actions = rng.uniform(-0.6, 0.6, (2, m, 12))
         sensed = [body(loco, k) for k in range(m)]
         history, clock = loco.actions, loco.clock.clock
@@ -209,7 +210,7 @@ def test_low_level_is_the_executors_step(
             assert got["action"] == pytest.approx(loco.actions[0, k], abs=3e-6)
             assert got["joint_targets"] == pytest.approx(loco.targets[0, k], abs=1e-6)
             assert got["next_clock"] == pytest.approx(loco.clock.clock[k], abs=1e-15)
-            counted = symmetric or start > 0.0  # a fixed pose does not swing
+            counted = symmetric or start > 0.0  # else no output depends on it
             assert ("next_cycles" in got) == counted
             if counted:
                 assert got["next_cycles"] == pytest.approx(loco.clock.cycles[k], abs=1e-12)
@@ -228,8 +229,11 @@ def test_low_level_is_the_executors_step(
 def test_high_level_is_the_tasks_observation_and_decoder(
     tmp_path: Path, cues: str, probes: str
 ) -> None:
-    """With a mirror, and without for probes that are not the same on both sides; with an encoder
-    before the LSTM where the cues are whole."""
+    """The graph decides and decodes as the policy does on the task's observation.
+
+    The policy has a mirror unless its probes differ from side to side, and an encoder before the
+    LSTM if it has both cues.
+    """
     narrow = dataclasses.replace(HIGH_CONFIG.commands, vx=(-0.5, 0.8), pitch=(0.0, 0.0))
     config = HighLevelConfig(
         cues=cues, probes=probes, action_limit=2.0, decimation=4, commands=narrow
@@ -362,7 +366,7 @@ def test_check_finds_other_weights(tmp_path: Path) -> None:
 
 
 def without_sources(table: dict[str, Any]) -> None:
-    """Forget which inputs come from the other graph."""
+    """Remove from an interface which inputs come from the other graph."""
     for signal in table["inputs"]:
         signal["source"] = None
 
@@ -404,7 +408,7 @@ def test_check_finds_an_interface_that_says_something_else(
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_clock_does_not_drift(folder: Path, form: str) -> None:
-    """1000 steps at 3.7 Hz: a step of 0.02 s rounded to float32 would be 3e-8 off by then."""
+    """1000 steps at 3.7 Hz are right to 1e-11; with 0.02 s rounded to float32: 3e-8 off by then."""
     graph = Graph(folder, "low", form)
     command = np.concatenate([np.full(12, 0.5), GAIT_TABLE[2]])
     command[4] = 3.7
@@ -465,7 +469,8 @@ def test_interface_says_how_to_drive_the_joints(folder: Path) -> None:
     assert control["joint_limits"]["high"][:3] == [0.86, 4.5, -0.89]
     assert control["target_margin"] == {"unit": "rad", "value": robot.joint_margin}
     assert table["start"]["joint_angles"]["value"] == nominal_pose(robot).tolist()
-    # 0.213 m each: thighs at 0.8 and 1 rad, calves at -0.7 and -0.5, and 22 mm of foot below
+    # Links of 0.213 m, with thighs at 0.8 and 1 rad and calves at -0.7 and -0.5 rad from the
+    # vertical, on feet of 22 mm radius.
     rear = 0.213 * (np.cos(1.0) + np.cos(0.5))
     front = 0.213 * (np.cos(0.8) + np.cos(0.7))
     hip = 0.08 * np.sin(0.1)
@@ -576,7 +581,7 @@ def test_command_writes_checks_and_reports(
 def test_a_robot_that_the_check_cannot_load_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its URDF names a mesh that is not there, which only a simulator asks for."""
+    """Its URDF names a missing mesh, which only a simulator tries to load."""
     shape, mesh = '<geometry><box size="0.3 0.15 0.1"/></geometry>', '<mesh filename="no.stl"/>'
     text = urdf_path(LOW_CONFIG.robot).read_text()
     assert shape in text
@@ -593,7 +598,7 @@ def test_a_robot_that_the_check_cannot_load_is_one_line(
 
 
 def save_pairs(path: Path) -> None:
-    """High policies that do not fit the shipped low policy, and one that does."""
+    """Save a high policy that fits the shipped low policy, and policies that do not fit."""
     fast = dataclasses.replace(HIGH_CONFIG.commands, vx=(-1.0, 1.5))
     physics = dataclasses.replace(LOW_CONFIG.physics, control_dt=0.01)
     random_high(path / "high", HIGH_CONFIG, hidden=4)

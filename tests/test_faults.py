@@ -1,4 +1,4 @@
-"""What the workers live through: a death, a hang, an error, robots that blow up, no parent."""
+"""Worker faults: death, hang, exception, robots that blow up, and a parent that is gone."""
 
 import json
 import os
@@ -24,16 +24,16 @@ from tdgc.state import State, join, split
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import CRITIC_LAYOUT
 
-# What a robot's action makes of its task.
+# Actions by which a robot makes its task fail.
 RAISE, DIE, HANG, NAN_SEEN, NAN_EARNED, INFINITE, FAR = range(2, 9)
 
 
 class Fragile:
-    """Robots that see their number, the level, the steps of their episode, and a random number.
+    """A task whose robots observe their number, the level, their steps and a random number.
 
-    They remember nothing beside their state, so there is nothing to forget. The level rises with
-    each step of the task and is all that it learns, as a curriculum is; the random number is drawn
-    at each restart. A robot earns its action.
+    It has no memory beyond its state, so ``forget`` only counts its calls. The level rises
+    with each step of the task and stands for what a task learns, such as a curriculum. The random
+    number is drawn at each restart. A robot's reward is its action.
     """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
@@ -105,7 +105,7 @@ SPACES = (Fragile.observation_space, Fragile.action_space)
 
 
 def actions(robots: int = 4, **asked: float) -> NDArray[np.float32]:
-    """Ones, but for the robots named as ``r2=DIE``."""
+    """Ones, except for robots with an action of their own, such as ``r2=DIE``."""
     values = np.ones((robots, 1), dtype=np.float32)
     for name, value in asked.items():
         values[int(name[1:])] = value
@@ -113,12 +113,12 @@ def actions(robots: int = 4, **asked: float) -> NDArray[np.float32]:
 
 
 def step(env: TaskVecEnv, values: NDArray[np.float32]) -> Any:
-    """Observations, rewards, ends and infos of a step."""
+    """Take a step: observations, rewards, dones and infos."""
     return env.step(values)
 
 
 def drawn(seed: int, count: int) -> np.float32:
-    """What a task with that seed draws at its restart number ``count``."""
+    """The number that a task with ``seed`` draws at its restart number ``count``."""
     return np.float32(np.random.default_rng(seed).uniform(size=count)[-1])
 
 
@@ -134,11 +134,11 @@ def fragile() -> Iterator[TaskVecEnv]:
 
 
 def test_workers_that_die_or_raise_are_started_anew(fragile: TaskVecEnv) -> None:
-    """The faults of worker 1; worker 0 goes on as if nothing had been."""
+    """Worker 1 dies, then raises; worker 0 continues undisturbed."""
     fragile.reset()
     for _ in range(5):
         step(fragile, actions())
-    fragile.state_dicts()  # level 5 is what is known
+    fragile.state_dicts()  # the last known level is 5
     reasons = {
         DIE: "worker 1 died (exit code -9)",
         RAISE: "worker 1 failed: ValueError: the ground is gone",
@@ -151,7 +151,7 @@ def test_workers_that_die_or_raise_are_started_anew(fragile: TaskVecEnv) -> None
         for i in (2, 3):
             np.testing.assert_array_equal(infos[i]["terminal_observation"], seen[i])
             assert infos[i]["TimeLimit.truncated"]
-        # Its level is the last known one, its randomness that of a seed on record.
+        # It has the last known level and random numbers from the recorded seed.
         seed = worker_seed(3, 1, restarts)
         assert obs[2:].tolist() == [[i, 5.0, 0.0, drawn(seed, 2)] for i in (0, 1)]
         assert obs[:2, 1].tolist() == obs[:2, 2].tolist() == [seen[0, 1] + 1] * 2
@@ -164,7 +164,7 @@ def test_workers_that_die_or_raise_are_started_anew(fragile: TaskVecEnv) -> None
         assert obs[2:, 1].tolist() == [6.0, 6.0] and obs[2:, 2].tolist() == [1.0, 1.0]
     assert not fragile.faults
     assert [state["restarts"] for state in fragile.state_dicts()] == [0, 2]
-    for _ in range(FAULT_STEPS):  # after so long, a third one is no pattern
+    for _ in range(FAULT_STEPS):  # after so long, a third fault is tolerated
         step(fragile, actions())
     step(fragile, actions(r2=RAISE))
     assert [fault.restarts for fault in fragile.faults] == [3]
@@ -186,7 +186,7 @@ def test_a_worker_that_hangs_is_started_anew() -> None:
 
 
 def test_faults_that_come_back_are_raised(fragile: TaskVecEnv) -> None:
-    """The third within a short stretch, of whichever worker; then the states are still known."""
+    """The third fault of any workers within ``FAULT_STEPS`` is raised; states stay available."""
     fragile.reset()
     step(fragile, actions())
     fragile.state_dicts()
@@ -200,13 +200,13 @@ def test_faults_that_come_back_are_raised(fragile: TaskVecEnv) -> None:
     )
     assert message.rstrip().endswith("ValueError: the ground is gone")
     assert [(f.worker, f.restarts) for f in fragile.faults] == [(0, 1), (1, 1)]
-    # Worker 0 was at level 1 when it was last asked, worker 1 has taken one step since.
+    # Worker 0 is broken, its last known level is 1; worker 1, restarted at 1, took one more step.
     assert [state["level"] for state in fragile.state_dicts()] == [1, 2]
     assert len(fragile.stats()) == 1
 
 
 def test_faults_between_steps(fragile: TaskVecEnv) -> None:
-    """Whatever is asked when a worker is found dead; and a resumed run knows of the restarts."""
+    """A worker found dead at any request is replaced; a resumed run knows the restarts."""
     fragile.reset()
     obs, *_ = step(fragile, actions())
     os.kill(fragile.worker_pids[0], signal.SIGKILL)
@@ -236,20 +236,20 @@ def test_faults_between_steps(fragile: TaskVecEnv) -> None:
 
 
 def test_the_state_of_a_broken_worker_begins_new_episodes(fragile: TaskVecEnv) -> None:
-    """Its robots' last episodes are gone; those of the other worker go on."""
+    """Its robots lose their episodes; those of the other worker continue."""
     fragile.reset()
     step(fragile, actions())
     fragile.state_dicts()
     seen, *_ = step(fragile, actions())
     os.kill(fragile.worker_pids[1], signal.SIGKILL)
-    fragile.forget()  # which it does not answer
+    fragile.forget()  # the dead worker does not answer
     states = fragile.state_dicts()
     assert [set(state) >= {"episodes", "obs", "lengths"} for state in states] == [True, False]
     other = TaskVecEnv(Fragile, 4, 2, seed=3, spaces=SPACES)
     other.load_state_dicts(states)
     assert other.starts().tolist() == [False, False, True, True]
     np.testing.assert_array_equal(other.seen()[:2], seen[:2])
-    assert other.seen()[2:, 1:3].tolist() == [[1.0, 0.0]] * 2  # the level it was known to have
+    assert other.seen()[2:, 1:3].tolist() == [[1.0, 0.0]] * 2  # the last known level
     other.forget()
     assert [sums["forgot"] for sums in other.stats()] == [1.0, 1.0]
     other.close()
@@ -259,7 +259,7 @@ def test_the_state_of_a_broken_worker_begins_new_episodes(fragile: TaskVecEnv) -
 
 
 def test_robots_that_blow_up_never_reach_the_learner() -> None:
-    """One that is far off ends alone; with a NaN or an infinity the world is built anew."""
+    """A robot with a huge value ends alone; a NaN or an infinity rebuilds the world."""
     env = TaskVecEnv(Fragile, 3, 1, seed=0, spaces=SPACES)
     seed, count = worker_seed(0, 0), 2
     env.reset()
@@ -284,7 +284,7 @@ def test_robots_that_blow_up_never_reach_the_learner() -> None:
 
 
 class Poisoned(LowLevelTask):
-    """In its eighth step, robot 1's motors give a torque that is not a number."""
+    """In the eighth step, the motors of robot 1 give a NaN torque."""
 
     steps = 0
 
@@ -300,14 +300,16 @@ class Poisoned(LowLevelTask):
 
 
 def make_poisoned(robots: int, seed: int) -> Poisoned:
-    # Actions of zero mean standing still then, whatever the commands.
+    # With the fixed pose, actions of zero mean standing still, whatever the commands.
     robot = RobotConfig(commanded_pose=False)
     return Poisoned(LowLevelConfig(robot=robot, physics=PhysicsConfig(substeps=4)), robots, seed)
 
 
 def test_a_blow_up_inside_bullet() -> None:
-    """A NaN in one robot leaves its neighbours without ground, even after its reset; so they
-    start anew with it, and stand again 25 steps later."""
+    """A NaN in one robot leaves its neighbours without ground, even after it is reset.
+
+    So all three start new episodes together, and stand again 24 steps later.
+    """
     probe = make_poisoned(1, 0)
     env = TaskVecEnv(make_poisoned, 3, 1, 0, (probe.observation_space, probe.action_space))
     env.reset()
@@ -323,7 +325,7 @@ def test_a_blow_up_inside_bullet() -> None:
     sums = env.stats()[0]
     assert sums["blow_ups"] == 1.0 and np.isfinite(list(sums.values())).all()
     layout = (*probe.locomotion.layout, *CRITIC_LAYOUT)
-    assert (np.abs(obs[:, columns(layout)["base_height"]]) < 0.5).all()  # 5 cm
+    assert (np.abs(obs[:, columns(layout)["base_height"]]) < 0.5).all()  # within 5 cm
     env.close()
     probe.close()
 
@@ -346,8 +348,10 @@ if __name__ == "__main__":
 @pytest.mark.skipif(sys.platform != "linux", reason="/dev/shm")
 @pytest.mark.parametrize("killed", [True, False])
 def test_nothing_outlives_the_parent(killed: bool, tmp_path: Path) -> None:
-    """Neither an idle worker nor one that hangs, whether the parent is killed or just ends; each
-    holds the parent's output open."""
+    """An idle worker and one that hangs both end, whether the parent is killed or just ends.
+
+    Each holds the parent's output open, so reading it to the end waits for both.
+    """
     here = Path(__file__).resolve()
     path, seconds = [str(here.parent), str(here.parents[1])], 1e6 if killed else 0.0
     script = tmp_path / "parent.py"

@@ -1,4 +1,4 @@
-"""Films show what was recorded, on the tile where it was; a missing encoder costs MP4 only."""
+"""Films show what was recorded, on the right tile; without an encoder only MP4s are missing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tdgc.tasks.rewards import CONTACT_FORCE
 
 
 def planted(steps: int = 25, policy: str = "gp", **changes: Any) -> Recording:
-    """A robot that glides along a tile with its legs still; a recording of ``steps`` steps."""
+    """A recording of ``steps`` steps: a robot glides along a tile with its legs still."""
     tile = tile_of(0, "gap", 8, 0)
     position = np.tile([*tile.start[:2], 0.32], (steps, 1))
     position[:, 0] += 0.01 * np.arange(steps)
@@ -56,7 +56,7 @@ def planted(steps: int = 25, policy: str = "gp", **changes: Any) -> Recording:
 
 
 def is_colour(pixels: Array, colour: Sequence[int], tolerance: int = 2) -> Array:
-    """(h, w) whether each pixel of (h, w, 3) has about that colour."""
+    """Whether each of the pixels (..., 3) is within ``tolerance`` of ``colour``, (...)."""
     return (np.abs(pixels.astype(int) - np.array(colour)) <= tolerance).all(axis=-1)
 
 
@@ -64,7 +64,7 @@ def is_colour(pixels: Array, colour: Sequence[int], tolerance: int = 2) -> Array
 
 
 class Notes:
-    """Looks on beside the recorder and keeps what it should have kept of episode 1."""
+    """A watcher that keeps what the recorder should keep of episode 1."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, Array]] = []
@@ -86,7 +86,7 @@ class Notes:
 
 
 def test_a_recording_is_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And the recorder changes nothing of it."""
+    """It equals what another watcher sees, and recording does not change the episode."""
     monkeypatch.setattr(evaluation, "HORIZON", 0.4)
     low, driver = load_low(PRETRAINED / "low")[0], BaselineDriver()
     cell, notes, recorder = Cell("gp", "nominal", "rough", 9, 0, 3), Notes(), Recorder(driver, 5, 2)
@@ -100,7 +100,7 @@ def test_a_recording_is_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     for key in ("position", "q", "command", "contact"):
         assert np.array_equal(getattr(second, key), [row[key] for row in notes.rows]), key
     assert second.contact.any() and second.desired.any() and not second.contact.all()
-    # It moves as fast as it says: over ground, in any direction.
+    # The recorded speed over ground, in any direction, fits the change of position.
     steps = np.diff(second.position[:, :2], axis=0)
     speed = np.linalg.norm(second.velocity[:, :2], axis=1)[1:]
     assert np.linalg.norm(steps, axis=1) == pytest.approx(0.02 * speed, rel=0.35, abs=2e-3)
@@ -127,7 +127,7 @@ def test_bars_of_contact() -> None:
 
 
 def test_the_diagram_shows_the_contacts_that_were_planted() -> None:
-    """150 steps fill its 3 s: each foot has a bar of its own where it was in contact."""
+    """150 steps fill its 3 s; dark bars mark each foot's contacts, pale ones those desired."""
     rng, steps = np.random.default_rng(0), 150
     contact = np.repeat(rng.random((steps // 10, 4)) < 0.5, 10, axis=0)
     recording = planted(steps, contact=contact, desired=~contact)
@@ -136,14 +136,14 @@ def test_the_diagram_shows_the_contacts_that_were_planted() -> None:
     assert frame.size == film.SIZE
     left, right = 44, film.SIZE[0] - 14
     middle = left + (right - left) * (np.arange(steps) + 0.5) / steps
-    # Steps at the border of a bar share a pixel with their neighbour.
+    # Steps at the border of a bar share a pixel with the next step.
     inside = (np.arange(steps) % 10 > 0) & (np.arange(steps) % 10 < 9)
     for foot in range(4):
         row = pixels[420 + 8 + 12 + 20 * foot + 8][middle.astype(int)]
         dark, pale = is_colour(row, (30, 34, 40)), is_colour(row, (176, 205, 235))
         assert (dark == contact[:, foot])[inside].all()
         assert (pale == ~contact[:, foot])[inside].all()
-    # Above them the gait: trot in the first half, bound in the second.
+    # The band above them shows the gait: trot in the first half, bound in the second.
     band = pixels[420 + 8 + 3][middle.astype(int)]
     for gait, half in ((0, slice(0, 70)), (3, slice(80, 150))):
         colour = plots.GAIT_COLOURS[gait]
@@ -156,7 +156,7 @@ def test_a_young_film_has_a_diagram_that_is_empty_at_the_left() -> None:
     pixels = np.asarray(film.Overlay(recording).frame(Image.new("RGB", (660, 420)), 29))
     dark = np.flatnonzero(is_colour(pixels[420 + 28], (30, 34, 40)))
     dark = dark[dark >= 44]
-    begin = 44 + (film.SIZE[0] - 14 - 44) * 0.8  # 0.6 s of 3 s
+    begin = 44 + (film.SIZE[0] - 14 - 44) * 0.8  # the 0.6 s fill the last fifth of 3 s
     assert dark.min() == pytest.approx(begin, abs=2) and dark.max() == pytest.approx(946, abs=2)
 
 
@@ -185,7 +185,7 @@ def test_the_goal_is_painted_where_it_is() -> None:
 
 
 def test_the_stage_shows_the_painted_goal_under_its_pole() -> None:
-    """Bullet lays the picture over the tile the right way round."""
+    """Bullet maps the picture onto the tile in the right orientation."""
     recording = planted()
     with film.staged(recording) as stage:
         goal = np.append(tile_of(0, "gap", 8, 0).goal, 0.0)
@@ -194,7 +194,7 @@ def test_the_stage_shows_the_painted_goal_under_its_pole() -> None:
         hidden = stage.picture(0, 201, 201, elevation=1.5, distance=2.0, target=goal)
     rows, columns = np.nonzero(is_colour(above, (0, 140, 90), 30))
     assert [rows.mean(), columns.mean()] == pytest.approx([100, 100], abs=6)
-    assert np.ptp(columns) == pytest.approx(1.0 / 1.66 * 201, abs=12)  # 2 m away, 45 degrees
+    assert np.ptp(columns) == pytest.approx(1.0 / 1.66 * 201, abs=12)  # 2 m away, FOV 45 degrees
     assert (above != hidden).any(axis=-1).mean() > 0.05  # the robot came into view
 
 
@@ -204,7 +204,7 @@ def test_the_stage_shows_the_painted_goal_under_its_pole() -> None:
 def test_a_film_can_be_decoded(tmp_path: Path) -> None:
     recording = planted(9)
     film.film(recording, tmp_path)
-    frames = 5 + 25  # steps 0, 2, 4, 6 and the last, which stays for a second
+    frames = 5 + 25  # steps 0, 2, 4, 6 and the last, which is held for a second
     with av.open(str(tmp_path / "film_gp_nominal_gap_08_000.mp4")) as file:
         stream = file.streams.video[0]
         assert stream.average_rate == 25 and (stream.width, stream.height) == film.SIZE
@@ -212,7 +212,7 @@ def test_a_film_can_be_decoded(tmp_path: Path) -> None:
     assert len(pictures) == frames
     direct = [np.asarray(frame) for frame in film.frames(recording)]
     for one, other in zip(pictures, direct, strict=True):
-        assert np.abs(one.astype(int) - other).mean() < 4.0  # but for compression
+        assert np.abs(one.astype(int) - other).mean() < 4.0  # up to compression
     assert (direct[0] != direct[4]).any(axis=-1)[:420, :660].mean() > 0.005
     with Image.open(tmp_path / "film_gp_nominal_gap_08_000.gif") as gif:
         assert gif.size == (film.SIZE[0] // 2, film.SIZE[1] // 2)
@@ -244,7 +244,7 @@ def test_a_strip_shows_all_policies_on_one_tile(tmp_path: Path) -> None:
         [pixels[40 + 266 * row :][:260, 112 + 406 * k :][:, :400] for k in range(5)]
         for row in range(2)
     ]
-    # Both begin at the same place on the same tile: the pictures differ in the way drawn only.
+    # Both begin at the same place on the same tile, so only the drawn paths differ.
     assert (shots[0][0] != shots[1][0]).any(axis=-1).mean() < 0.05
     assert (shots[1][0] != shots[1][4]).any(axis=-1).mean() > 0.05
     assert film.moments(ours) == [0, 8, 15, 22, 30]
@@ -254,7 +254,7 @@ def test_a_strip_shows_all_policies_on_one_tile(tmp_path: Path) -> None:
 
 
 def test_a_sheet_has_the_bars_that_were_planted(tmp_path: Path) -> None:
-    """All feet on the ground in the first half alone: as much black there as the bars are."""
+    """All feet are in contact in the first half only, so the black bars cover just that half."""
     for name, share in (("none", 0.0), ("half", 0.5)):
         contact = np.zeros((100, 4), dtype=bool)
         contact[: round(100 * share)] = True
@@ -278,7 +278,7 @@ def test_a_sheet_has_the_bars_that_were_planted(tmp_path: Path) -> None:
 
 
 def evaluate_short(out: Path, monkeypatch: pytest.MonkeyPatch, *flags: str) -> int:
-    """Two policies, one cell, episodes of 0.1 s, all in this process."""
+    """Run the script in this process: two policies, one cell each, episodes of 0.1 s."""
     monkeypatch.setattr(evaluation, "HORIZON", 0.1)
     monkeypatch.setattr(evaluate, "run_jobs", lambda work, jobs, workers: map(work, jobs))
     monkeypatch.setattr(film, "run_jobs", lambda work, jobs, workers: map(work, jobs))

@@ -1,8 +1,8 @@
-"""Whatever a file or a flag holds: it is refused in one line or comes back as it was.
+"""Fuzzing: whatever a file or flag holds is refused in one line or survives a round trip.
 
 Every reader is given damaged, foreign and hostile input. It may raise the error that it documents,
-with a message of one line, or return a value that survives being written and read again. It runs
-no code, and writes nothing outside the folder given.
+with a message of one line, or return a value that survives being written and read again. It must
+not run code from the input or write outside the given folder.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ Value = TypeVar("Value")
 
 @pytest.fixture(scope="module", autouse=True)
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """What is read lies in here; the folder around it is the working directory."""
+    """Folder for the files to read; the working directory is its parent."""
     around = tmp_path_factory.mktemp("around")
     (around / "given").mkdir()
     with contextlib.chdir(around):
@@ -69,17 +69,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def answer(read: Callable[[], Value], *errors: type[InputError]) -> Value | None:
-    """What was read, or None where it was refused as documented."""
+    """Return what ``read`` returns, or None if it refuses its input as documented."""
     try:
         return read()
     except InputError as error:
         assert type(error) in errors and str(error) and str(error).isprintable()
         return None
     finally:
-        assert os.listdir() == ["given"]  # nothing was run, or written beside the folder
+        assert os.listdir() == ["given"]  # no code ran, nothing was written outside
 
 
-# ------------------------------------------------------------------ what there is to read
+# ------------------------------------------------------------------ input
 
 
 class Bomb:
@@ -104,7 +104,7 @@ def test_the_bomb_is_live() -> None:
 
 
 NUMBERS = (
-    st.integers(-(2**53), 2**53)  # all of them floats, too
+    st.integers(-(2**53), 2**53)  # all exact as floats
     | st.floats()
     | st.sampled_from([10**400, -(10**400), 2**63, 2**128, 1e308, -0.0, 0.1])
 )
@@ -116,7 +116,7 @@ VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(WORDS, inner, max_size=3),
     max_leaves=6,
 )
-#: Places and bytes: to be written over, to be put in, or None to cut the rest off.
+#: Places, whether to overwrite or insert, and the bytes; None cuts off the rest.
 DAMAGE = st.lists(
     st.tuples(st.integers(0, 2**20), st.booleans(), st.none() | st.binary(min_size=1, max_size=4)),
     min_size=1,
@@ -136,7 +136,7 @@ def damaged(data: bytes, damage: Damage) -> bytes:
 
 
 def places(tree: Any, where: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The keys that lead to each node of a JSON tree."""
+    """Yield the keys that lead to each node of a JSON tree."""
     inner = enumerate(tree) if isinstance(tree, list) else tree.items()
     for key, value in inner:
         yield (*where, key)
@@ -281,7 +281,7 @@ def policy(folder: Path) -> tuple[Path, bytes, bytes]:
 
 
 def check_policy(path: Path, text: bytes, weights: bytes) -> policies.Policy | None:
-    """Load a policy of these files; what is accepted must be whole and finite."""
+    """Load a policy from these files; if it is accepted, it must be complete and finite."""
     Path(f"{path}.json").write_bytes(text)
     Path(f"{path}.safetensors").write_bytes(weights)
     found = answer(lambda: policies.load(path), PolicyFileError)
@@ -295,7 +295,7 @@ def check_policy(path: Path, text: bytes, weights: bytes) -> policies.Policy | N
 
 
 def summed(text: bytes, weights: bytes) -> bytes:
-    """The JSON with the checksum of other weights, so that these are looked at."""
+    """The JSON with the checksum of other weights, so that their content is checked."""
     table = json.loads(text)
     return json.dumps({**table, "sha256": hashlib.sha256(weights).hexdigest()}).encode()
 
@@ -346,7 +346,7 @@ TENSORS = st.dictionaries(
 
 
 def tensor_file(table: Any, content: bytes, size: int | None) -> bytes:
-    """A safetensors file with any header, and if told with a wrong length of it."""
+    """A safetensors file with any header, whose stated length is ``size`` if given."""
     header = json.dumps(table).encode()
     return struct.pack("<Q", len(header) if size is None else size) + header + content
 
@@ -372,7 +372,7 @@ def test_foreign_weights(policy: tuple[Path, bytes, bytes], weights: bytes, padd
     assert check_policy(path, weights, good) is None
 
 
-@pytest.mark.filterwarnings("ignore:overflow encountered in exp")  # of a log_std of 3e38
+@pytest.mark.filterwarnings("ignore:overflow encountered in exp")  # from a log_std of 3e38
 @examples
 @given(st.data(), st.sampled_from([np.nan, np.inf, -np.inf, 3e38]), st.sampled_from("abcd"))
 def test_weights_of_other_shapes_and_numbers(
@@ -395,7 +395,7 @@ def test_weights_of_other_shapes_and_numbers(
 
 @pytest.fixture(scope="module")
 def pair(folder: Path) -> dict[str, Any]:
-    """A low and a high policy, and what their JSON holds."""
+    """Save a low and a high policy; return the contents of their JSON files."""
     for kind in ("json", "safetensors"):
         shutil.copy(f"{PRETRAINED / 'low'}.{kind}", f"{folder / 'low'}.{kind}")
     save_high(folder / "high", load_low(folder / "low"))
@@ -427,7 +427,7 @@ def test_levels_with_any_meta(
 
 @pytest.fixture(scope="module")
 def checkpoint(folder: Path) -> tuple[Path, bytes, bytes]:
-    """A checkpoint's path, its header and its tensors; beside it stands an older one."""
+    """A checkpoint's path, its header and its tensors; an older one is beside it."""
     tensors = {"policy.a": th.arange(6.0).reshape(2, 3), "random.torch": th.tensor([1, 2, 3])}
     header = {
         "format": "tdgc-checkpoint",
@@ -443,7 +443,7 @@ def checkpoint(folder: Path) -> tuple[Path, bytes, bytes]:
 
 
 def check_checkpoint(path: Path, text: bytes, tensors: bytes) -> None:
-    """Read a checkpoint with these files; a run goes on from it, or from the one before."""
+    """Read a checkpoint with these files; a run must resume from it or from the one before."""
     (path / "state.json").write_bytes(text)
     (path / "state.safetensors").write_bytes(tensors)
     found = answer(lambda: Checkpoint.read(path), CheckpointError)
@@ -457,7 +457,7 @@ def check_checkpoint(path: Path, text: bytes, tensors: bytes) -> None:
         assert json.dumps(newest.header) == json.dumps(found.header) and not told
         with tempfile.TemporaryDirectory(dir=run.parent) as copy:
             again = Checkpoint.read(found.save(Path(copy)))
-        # There is more than one way to write a tensor.
+        # Both are written again, as there is more than one way to write a tensor.
         assert safetensors.torch.save(again.tensors) == safetensors.torch.save(found.tensors)
         told_apart = ("sha256",)
         kept, written = (
@@ -507,7 +507,7 @@ def test_checkpoints_as_deep_as_can_be_read(checkpoint: tuple[Path, bytes, bytes
 
 @pytest.fixture(scope="module")
 def traced(folder: Path) -> tuple[Trace, bytes]:
-    """A trace of three rows and its file's content."""
+    """A trace of three rows and the content of its file."""
     rng = np.random.default_rng(0)
     columns: dict[str, Any] = {}
     for c in COLUMNS:

@@ -1,4 +1,4 @@
-"""Gaits: which foot runs at which phase, the warp by duty factor, the contact schedule."""
+"""Gaits: phases of the feet, the warp by duty factor, the contact schedule and the clock."""
 
 import math
 
@@ -42,8 +42,8 @@ def test_embedding_of_no_gait(index: int | list[int]) -> None:
         gait_embedding(index)
 
 
-# At g = 0.1 and a duty factor of one half, by hand: FL g + phase + offset + bound, FR g + offset,
-# RL g + bound, RR g + phase.
+# Computed by hand at g = 0.1 and a duty factor of one half: FL g + phase + offset + bound,
+# FR g + offset, RL g + bound, RR g + phase.
 @pytest.mark.parametrize(
     ("gait", "front_left", "front_right", "rear_left", "rear_right"),
     [
@@ -65,7 +65,7 @@ def test_every_foot_of_every_gait(
 
 
 def test_the_three_terms_one_by_one() -> None:
-    """Values no gait has, so that a term that goes to the wrong foot shows."""
+    """Values that no gait has, so that a term added to the wrong foot shows."""
     phases = foot_phases(np.array([0.05]), np.array([[0.1, 0.2, 0.3]]), np.array([0.5]))
     np.testing.assert_allclose(phases, [[0.65, 0.25, 0.35, 0.15]], atol=1e-12)
 
@@ -118,7 +118,7 @@ def test_desired_contact() -> None:
     assert mid_swing == pytest.approx(2 * tail * (1.0 - tail), abs=1e-6) and mid_swing < 0.001
     assert lift_off == pytest.approx(0.5, abs=1e-6)
     assert touch_down == pytest.approx(0.5, abs=1e-6)
-    # One standard deviation into stance, and out of it.
+    # One standard deviation inside stance, and one outside.
     edges = desired_contact(np.array([0.07, 0.43, 0.57, 0.93]))
     np.testing.assert_allclose(edges, [0.8413447, 0.8413447, 0.1586553, 0.1586553], atol=1e-6)
 
@@ -174,7 +174,7 @@ def test_swing_grows_over_the_first_cycles_of_a_gait() -> None:
         clock.advance(0.02, frequency, trot, duty)
     np.testing.assert_allclose(clock.cycles, [0.4, 0.8], atol=1e-12)
     np.testing.assert_allclose(clock.phases[:, 0], [0.9, 0.3], atol=1e-12)
-    height = math.sin(0.8 * math.pi)  # 0.8 of its swing
+    height = math.sin(0.8 * math.pi)  # at 0.8 of its swing
     np.testing.assert_allclose(clock.swing(1.0)[0], [0.4 * height, 0, 0, 0.4 * height], atol=1e-12)
     np.testing.assert_allclose(clock.swing(0.5)[0], [0.8 * height, 0, 0, 0.8 * height], atol=1e-12)
     np.testing.assert_allclose(clock.swing(0.2)[0], [height, 0, 0, height], atol=1e-12)
@@ -182,7 +182,7 @@ def test_swing_grows_over_the_first_cycles_of_a_gait() -> None:
     np.testing.assert_allclose(clock.begun(2.0), [0.2, 0.4], atol=1e-12)
     np.testing.assert_allclose(clock.begun(0.5), [0.8, 1.0], atol=1e-12)
     assert clock.begun(0.0).tolist() == [1.0, 1.0]
-    clock.update(pronk, duty)  # another gait for the second
+    clock.update(pronk, duty)  # the second robot changes its gait
     np.testing.assert_allclose(clock.cycles, [0.4, 0.0], atol=1e-12)
     assert (clock.swing(1.0)[1] == 0.0).all() and (clock.swing(0.0)[1] == 0.0).sum() == 0
     clock.advance(0.02, frequency, pronk, duty)

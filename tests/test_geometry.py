@@ -1,4 +1,4 @@
-"""What is read from a URDF, of the shipped robot and of another; what is refused, and why."""
+"""What is read from the URDFs of the shipped and other robots; which URDFs are refused, and why."""
 
 import dataclasses
 import re
@@ -38,7 +38,7 @@ STILL, UPRIGHT = np.zeros((1, 12)), np.array([[0.0, 0.0, 0.0, 1.0]])
 
 
 def larger(text: str) -> str:
-    """Our robot with longer legs, hips further out and apart, a heavier trunk and other limits."""
+    """The shipped URDF with longer legs, wider hips, larger feet, a heavier trunk, other limits."""
     for old, new in (
         ('xyz="0 0 -0.213"', 'xyz="0 0 -0.25"'),  # calf joints, knees and feet
         ('<origin xyz="0.183 ', '<origin xyz="0.22 '),
@@ -53,7 +53,7 @@ def larger(text: str) -> str:
     ):
         assert old in text
         text = text.replace(old, new)
-    # Right hips turn as far outwards as left ones, in a mirror.
+    # Both front hips turn outwards by 0.9 and inwards by 0.7 rad, so their limits are mirrored.
     limits = 'lower="{}" upper="{}" effort="23.7" velocity="30"'
     for leg, low, high in (("FL", -0.7, 0.9), ("FR", -0.9, 0.7)):
         before, joint, after = text.partition(f'<joint name="{leg}_hip_joint"')
@@ -65,7 +65,7 @@ def larger(text: str) -> str:
 
 @pytest.fixture
 def robot(tmp_path: Path) -> RobotConfig:
-    """The larger robot, with what goes with it."""
+    """The larger robot, with gains and a base height that suit it."""
     path = tmp_path / "larger.urdf"
     path.write_text(larger(SHIPPED), encoding="utf-8")
     return RobotConfig(urdf=str(path), kp=40.0, kd=1.0, base_height=0.35)
@@ -73,10 +73,13 @@ def robot(tmp_path: Path) -> RobotConfig:
 
 @pytest.fixture
 def a1(tmp_path: Path) -> RobotConfig:
-    """PyBullet's Unitree A1 with our names of joints: feet and an IMU that are fixed to links, and
-    a trunk whose centre of mass is off its frame, its inertia turned in there."""
+    """PyBullet's Unitree A1 with our joint names.
+
+    Its feet and its IMU are links on fixed joints. The trunk's centre of mass is not at the origin
+    of its frame, and its principal axes are rotated in it.
+    """
     text = (Path(pybullet_data.getDataPath()) / "a1" / "a1.urdf").read_text(encoding="utf-8")
-    text = re.sub("<visual>.*?</visual>", "", text, flags=re.DOTALL)  # its meshes
+    text = re.sub("<visual>.*?</visual>", "", text, flags=re.DOTALL)  # without its meshes
     for part, ours in (("upper", "thigh"), ("lower", "calf")):
         text = text.replace(f"{part}_joint", f"{ours}_joint")
     path = tmp_path / "a1.urdf"
@@ -85,7 +88,7 @@ def a1(tmp_path: Path) -> RobotConfig:
 
 
 def changed(folder: Path, *changes: tuple[str, str]) -> RobotConfig:
-    """The shipped robot with ``changes`` in its URDF: what is replaced, all of it, by what."""
+    """The shipped robot with each (old, new) of ``changes`` replaced everywhere in its URDF."""
     text, path = SHIPPED, folder / "changed.urdf"
     for old, new in changes:
         assert old in text
@@ -94,7 +97,7 @@ def changed(folder: Path, *changes: tuple[str, str]) -> RobotConfig:
     return RobotConfig(urdf=str(path))
 
 
-# ------------------------------------------------------------------ what follows from it
+# ------------------------------------------------------------------ settings that fit a robot
 
 
 def test_the_shipped_robots_settings_fit_itself() -> None:
@@ -103,7 +106,7 @@ def test_the_shipped_robots_settings_fit_itself() -> None:
 
 
 def test_settings_for_another_robot(a1: RobotConfig, robot: RobotConfig) -> None:
-    """A1: 12.458 of 12.6 kg, legs of 0.4 of 0.426 m, and what its URDF says of its motors."""
+    """The A1: 12.458 kg to our 12.6, legs of 0.4 m to our 0.426, motor limits from its URDF."""
     found = fitted(a1)
     assert found == {
         "base_height": 0.28, "kp": 18.6, "kd": 0.54,
@@ -147,19 +150,22 @@ def test_a_robot_with_fixed_links(a1: RobotConfig) -> None:
     geometry = read_geometry(a1)
     assert geometry.hips.tolist() == read_geometry(RobotConfig()).hips.tolist()
     assert (geometry.abduction, geometry.thigh, geometry.calf) == (0.08505, 0.2, 0.2)
-    assert (geometry.foot_radius, geometry.trunk_mass) == (0.02, 4.714)  # an IMU of 1 g on it
+    assert (geometry.foot_radius, geometry.trunk_mass) == (0.02, 4.714)  # including an IMU of 1 g
     assert geometry.joint_limits[1].tolist() == [-1.0471975512, 4.18879020479]
 
 
 def test_a_foot_on_links_that_are_turned(tmp_path: Path) -> None:
-    """A shin 10 cm down the calf, turned by roll, pitch and yaw, and on it a foot that is 12 cm
-    further down in the calf's frame."""
+    """A foot on two fixed links is found where it is in the calf's frame, 22 cm down.
+
+    The shin is 10 cm down the calf, rotated in roll, pitch and yaw; the foot on it is another 12 cm
+    down in the calf's frame.
+    """
     quaternion = pybullet.getQuaternionFromEuler([0.3, 0.2, 0.1])
     turned = np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3))
     down = " ".join(map(str, turned.T @ [0.0, 0.0, -0.12]))
     foot = '<collision><origin xyz="0 0 -0.213" rpy="0 0 0"/><geometry><sphere radius="0.022"/>'
     foot += "</geometry></collision>"
-    assert foot in SHIPPED  # feet, and knees with them
+    assert foot in SHIPPED  # of the feet, and of the knees too
     link = '<inertial><mass value="0.01"/></inertial>'
     text = SHIPPED.replace(foot, "")
     for leg in ("FL", "FR", "RL", "RR"):
@@ -196,11 +202,11 @@ def test_names_of_links_and_order_do_not_matter(tmp_path: Path) -> None:
     assert geometry.hips.tolist() == read_geometry(RobotConfig()).hips.tolist()
 
 
-# ------------------------------------------------------------------ another robot, everywhere
+# ------------------------------------------------------------------ another robot in all modules
 
 
 def feet_by_bullet(world: World) -> np.ndarray:
-    """Feet of robot 0 from where Bullet says its calves are, (4, 3) m."""
+    """Foot positions of robot 0, from Bullet's poses of its calves, (4, 3) m."""
     body, client = world._bodies[0], world._client_of[0]
     feet = []
     for k in range(4):
@@ -214,7 +220,7 @@ def feet_by_bullet(world: World) -> np.ndarray:
 def test_kinematics_of_another_robot_are_bullets(
     which: str, request: pytest.FixtureRequest
 ) -> None:
-    """In any attitude, before a step and after it."""
+    """Foot positions agree with Bullet's in any attitude, before and after a step."""
     config = request.getfixturevalue(which)
     world, rng = World(1, config, PhysicsConfig()), np.random.default_rng(0)
     nothing = np.zeros(1), np.zeros((1, 12))
@@ -231,7 +237,7 @@ def test_kinematics_of_another_robot_are_bullets(
 
 
 def test_trunk_that_turns_about_its_frame(tmp_path: Path) -> None:
-    """Its centre of mass, 2 cm ahead, moves with 2 rad/s x 2 cm to the left, its frame rests."""
+    """The frame rests; the centre of mass, 2 cm ahead, moves left at 2 rad/s x 2 cm = 0.04 m/s."""
     trunk = '<origin xyz="0 0 0" rpy="0 0 0"/>\n      <mass value="5.6"/>'
     config = changed(tmp_path, (trunk, trunk.replace("0 0 0", "0.02 0 0", 1)))
     world = World(1, config, PhysicsConfig())
@@ -250,7 +256,7 @@ def test_trunk_that_turns_about_its_frame(tmp_path: Path) -> None:
 
 
 def test_trunk_with_turned_inertia(a1: RobotConfig) -> None:
-    """It is put where ``state`` has it and read back as it was put."""
+    """Pose and velocities are read back as set, though the principal axes differ from the frame."""
     world = World(1, a1, PhysicsConfig())
     state, client, body = world.state, world._client_of[0], world._bodies[0]
     quaternion = np.array([pybullet.getQuaternionFromEuler([0.3, -0.5, 1.0])])
@@ -268,7 +274,7 @@ def test_trunk_with_turned_inertia(a1: RobotConfig) -> None:
 
 
 def test_a_robot_with_fixed_links_stands_on_its_feet(a1: RobotConfig) -> None:
-    """All its weight, that of its feet and shoulders among it, is on its feet."""
+    """Its feet carry all its weight, including that of the fixed feet and shoulders."""
     a1 = dataclasses.replace(a1, commanded_gait=False)
     task = LowLevelTask(LowLevelConfig(robot=a1), 1, seed=0, training=False)
     task.reset(np.arange(1))
@@ -284,7 +290,7 @@ def test_a_robot_with_fixed_links_stands_on_its_feet(a1: RobotConfig) -> None:
 
 
 def test_what_is_fixed_to_the_trunk_is_its_own(tmp_path: Path) -> None:
-    """A keel of 30 cm below the trunk carries the robot, and that is a hit on the trunk."""
+    """A keel 30 cm below the trunk carries the robot, and its contact counts as the trunk's."""
     keel = (
         '<joint name="keel" type="fixed"><parent link="trunk"/><child link="keel"/></joint>'
         '<link name="keel"><inertial><mass value="0.1"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" '
@@ -314,8 +320,12 @@ TURNED = (
 
 
 def by_itself(urdf: Path) -> tuple[np.ndarray, np.ndarray]:
-    """What Bullet makes of a URDF, without this package: joint angles and the trunk's pose over
-    0.2 s of random torques in the air (80, 19), and which of 400 rays from above hit it where."""
+    """What Bullet makes of a URDF without this package.
+
+    Returns:
+        The joint angles and the pose of the FL hip over 0.2 s of random torques in mid-air, without
+        gravity, (80, 19); and the hit fractions of 400 rays from above, (400,), 1 for a miss.
+    """
     client, rng = pybullet.connect(pybullet.DIRECT), np.random.default_rng(0)
     whole = pybullet.URDF_USE_INERTIA_FROM_FILE
     body = pybullet.loadURDF(str(urdf), [0, 0, 1], flags=whole, physicsClientId=client)
@@ -324,7 +334,7 @@ def by_itself(urdf: Path) -> tuple[np.ndarray, np.ndarray]:
     joints = [named[name] for name in JOINTS]
     x, y = np.meshgrid(np.linspace(-0.4, 0.4, 20), np.linspace(-0.3, 0.3, 20))
     above, below = (np.stack([x, y, np.full_like(x, z)], -1).reshape(-1, 3) for z in (2.0, 0.0))
-    pybullet.performCollisionDetection(client)  # before it shapes have no bounds
+    pybullet.performCollisionDetection(client)  # shapes have no bounds without it
     hits = pybullet.rayTestBatch(above.tolist(), below.tolist(), physicsClientId=client)
     for k in (-1, *links):
         pybullet.setCollisionFilterGroupMask(body, k, 0, 0, client)
@@ -353,7 +363,7 @@ def by_itself(urdf: Path) -> tuple[np.ndarray, np.ndarray]:
 def test_what_is_fixed_moves_with_its_carrier(
     which: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """As in Bullet, which simulates a link of its own instead."""
+    """Merged links move and stop rays as in Bullet, which simulates each as a separate body."""
     config = changed(tmp_path, ("</robot>", TURNED)) if which == "turned" else None
     config = config or request.getfixturevalue("a1")
     with merged_file(config) as merged:
@@ -371,7 +381,7 @@ def test_nothing_fixed_nothing_written() -> None:
 
 
 def test_meshes_are_found_from_elsewhere(tmp_path: Path) -> None:
-    """Relative to the URDF or to a package; others stay as they are, for Bullet to say so."""
+    """They may be relative to the URDF or its package; other names stay, for Bullet to report."""
     (tmp_path / "dog" / "urdf").mkdir(parents=True)
     (tmp_path / "dog" / "hull.stl").touch()
     (tmp_path / "dog" / "urdf" / "mast.stl").touch()
@@ -401,7 +411,7 @@ def test_leg_angles_of_another_robot(robot: RobotConfig) -> None:
     q = nominal_pose(robot) + rng.uniform(-0.4, 0.4, (200, 12))
     feet, _ = foot_kinematics(geometry, q, np.zeros_like(q))
     np.testing.assert_allclose(leg_angles(geometry, feet), q, atol=1e-12)
-    # The shipped robot's legs would reach elsewhere with them.
+    # With the same angles, the shipped robot's feet would be elsewhere.
     shipped, _ = foot_kinematics(read_geometry(RobotConfig()), q, np.zeros_like(q))
     assert np.abs(feet - shipped).min(axis=0).max() > 0.03
 
@@ -416,7 +426,7 @@ def test_payload_is_on_top_of_its_own_trunk(robot: RobotConfig) -> None:
 
 
 def test_another_robot_stands_at_the_commanded_height(robot: RobotConfig) -> None:
-    """On zero actions it stands on its feet at its base height, and 3 cm lower when told to."""
+    """With zero actions it stands on its feet at its base height, or 3 cm lower if commanded to."""
     robot = dataclasses.replace(robot, commanded_gait=False)
     task = LowLevelTask(LowLevelConfig(robot=robot), 2, seed=0, training=False)
     task.reset(np.arange(2))
@@ -456,7 +466,7 @@ def test_commanded_and_exported_pose_of_another_robot(robot: RobotConfig) -> Non
         for time in (0.01, 0.01 + robot.kd / robot.kp)
     )
     walking = walking_pose(robot, geometry, command, now, ahead, np.ones(20))
-    assert np.abs(walking - pose).max() > 0.1  # the weight of 15 kg on stiffer joints
+    assert np.abs(walking - pose).max() > 0.1  # footholds, and 15 kg on stiffer joints
     for gait, wanted in ((False, pose), (True, walking)):
         graph = graphs.Pose(dataclasses.replace(robot, commanded_gait=gait), 0.02)
         for k in range(20):
@@ -467,7 +477,7 @@ def test_commanded_and_exported_pose_of_another_robot(robot: RobotConfig) -> Non
 
 
 def test_rewards_know_another_robots_limits(robot: RobotConfig) -> None:
-    """A knee at -2.6 rad is at its limit, 0.0855 rad beyond nine tenths of -2.6..-0.89."""
+    """A knee at its limit of -2.6 rad is 0.0855 rad beyond the middle 0.9 of -2.6..-0.89 rad."""
     task = LowLevelTask(LowLevelConfig(robot=robot), 1, seed=0)
     q = nominal_pose(robot)
     q[2] = -2.6
@@ -498,7 +508,7 @@ FL_HIP = '<origin xyz="0.183 0.047 0" rpy="0 0 0"/>'
 FIXED = '<joint name="imu_joint" type="fixed"><parent link="trunk"/><child link="imu"/></joint>'
 DIFFERS = "legs must be equal, mirrored left to right"
 
-#: What is replaced in the shipped URDF, all of it, by what, and how the message goes on after the
+#: Text in the shipped URDF, its replacement everywhere, and how the message continues after the
 #: file's name.
 REFUSED = [
     ("</robot>", "", r"not an XML file: no element found"),
@@ -517,7 +527,7 @@ REFUSED = [
     ),
     ("</robot>", "<link name='imu'/></robot>", r"link 'imu': belongs to no leg and is not fixed"),
     ("</robot>", "<link name='FL_hip'/></robot>", r"two of its links have one name"),
-    ('<link name="RR_calf">', '<link name="RR_shin">', r".*link 'RR_calf', which is not there"),
+    ('<link name="RR_calf">', '<link name="RR_shin">', r".*link 'RR_calf', which is missing"),
     ("revolute", "fixed", r"joint 'FL_hip_joint': must be revolute about the axis 1 0 0"),
     ('<parent link="FL_hip"/>', '<parent link="FR_hip"/>', r"joint 'FL_thigh_joint': its parent"),
     ("revolute", "continuous", r"joint 'FL_hip_joint': must be revolute about the axis 1 0 0"),
@@ -587,12 +597,12 @@ def test_a_urdf_that_bullet_cannot_load(tmp_path: Path) -> None:
     path = tmp_path / "mesh.urdf"
     box, mesh = '<box size="0.42 0.15 0.11"/>', '<mesh filename="nothing.stl"/>'
     path.write_text(SHIPPED.replace(box, mesh), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"mesh\.urdf: Bullet cannot load it and says why above$"):
+    with pytest.raises(ConfigError, match=r"mesh\.urdf: Bullet cannot load it, see above$"):
         World(1, RobotConfig(urdf=str(path)), PhysicsConfig())
 
 
 def test_scripts_refuse_it_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """A robot to be trained, one that a policy was trained on, and one that only Bullet refuses."""
+    """A robot to train, the robot of a trained policy, and one that only Bullet cannot load."""
     path, results = tmp_path / "other.urdf", tmp_path / "results" / "diagnosis.csv"
     low = tmp_path / "low.json"
     text = (PRETRAINED / "low.json").read_text(encoding="utf-8")
@@ -618,5 +628,5 @@ def test_scripts_refuse_it_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixt
         ("evaluate.py", evaluate.main, table),
     ):
         assert main(arguments) == 2
-        said = f"{name}: {path}: Bullet cannot load it and says why above"
+        said = f"{name}: {path}: Bullet cannot load it, see above"
         assert capfd.readouterr().err.splitlines()[-1] == said

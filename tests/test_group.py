@@ -1,4 +1,4 @@
-"""A group of tasks: each does what it does alone."""
+"""``TaskGroup``: each task behaves as it does alone."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ def make() -> tuple[LowLevelTask, LowLevelTask]:
 
 
 def advance(task: LowLevelTask | TaskGroup, steps: int, seed: int) -> list[np.ndarray]:
-    """Take steps of random actions as a worker does; what was seen and rewarded."""
+    """Step with random actions as a worker does; return rewards, flags and observations."""
     everything = np.random.default_rng(seed).normal(size=(steps, 5, 12))
     seen = []
     for actions in everything:
@@ -34,7 +34,7 @@ def advance(task: LowLevelTask | TaskGroup, steps: int, seed: int) -> list[np.nd
 
 
 def test_each_does_what_it_does_alone() -> None:
-    """Over the ends of episodes, which last 20 steps; and their sums are added."""
+    """This holds through the ends of episodes, which last 20 steps; statistics are summed."""
     plane, tiles = make()
     group = TaskGroup(make())
     assert group.num_robots == 5

@@ -1,4 +1,4 @@
-"""Sliders become commands; without a display there is one line, and the process lives on."""
+"""The GUI: sliders become commands; without a display the script prints a line and returns."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_text_says_gait_and_velocities() -> None:
 def test_no_display(
     mode: str, display: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Neither one that is not set nor one that is not there."""
+    """An empty ``DISPLAY`` and one that does not exist are refused in one line."""
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setenv("DISPLAY", display)
     with pytest.raises(WindowError):

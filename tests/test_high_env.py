@@ -1,4 +1,4 @@
-"""The decision level: observation, rewards, curriculum order, tiles, refusals."""
+"""The decision-level MDP: observation, rewards, curriculum, tiles, teacher, resume, refusals."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def step_of(**changes) -> HighStep:
 
 
 def test_goal_distance_is_the_papers_curve():
-    # R_map = 8, a = 1, b = 3: half way p = 0.5.
+    # R_map = 8, a = 1, b = 3: halfway, p = 0.5.
     assert rewards.goal_distance(step_of())[0] == pytest.approx(0.5 + 1.0 - np.exp(-1.5))
     assert rewards.goal_distance(step_of(distance=np.array([9.0])))[0] == 0.0
     assert rewards.goal_distance(step_of(distance=np.array([0.0])))[0] == pytest.approx(
@@ -142,8 +142,12 @@ def test_without_step_time_scaling_weights_are_per_decision():
 
 
 def worth(rewards_config: HighRewardConfig, falls: float) -> tuple[float, float]:
-    """What marking time at the start is worth, and walking on at 0.5 m/s to 0.7 m from the goal
-    and marking time there, while ``falls`` robots a second fall and then get nothing."""
+    """Discounted return of marking time at the start, and of walking towards the goal instead.
+
+    The walk leads from 6.5 m to 0.7 m from the goal at 0.5 m/s; there the robot marks time. On the
+    way it falls ``falls`` times a second, after which it earns nothing. It is never slow enough to
+    count as lazy.
+    """
 
     def each(distance: float) -> float:
         seen = step_of(
@@ -159,7 +163,11 @@ def worth(rewards_config: HighRewardConfig, falls: float) -> tuple[float, float]
 
 
 def test_without_a_teacher_standing_at_the_start_does_not_pay():
-    """The untrained policy falls 0.08 times a second on level 0: by default it may as well stay."""
+    """With the settings for training without a teacher, walking pays more than standing.
+
+    The untrained policy falls 0.08 times a second on level 0. By default it then gains next to
+    nothing by walking, and at 0.1 falls a second it loses.
+    """
     stay, walk = worth(HighRewardConfig(), 0.08)
     assert stay == pytest.approx(9.18, abs=0.01) and walk == pytest.approx(9.56, abs=0.05)
     assert worth(HighRewardConfig(), 0.1)[1] < stay
@@ -194,7 +202,7 @@ def test_sees_how_fast_the_goal_comes_nearer(task):
 
 @pytest.mark.parametrize("cues", ["both", "semantic", "geometric", "none"])
 def test_mirrored_robots_see_mirrored_things(cues):
-    """A robot and its mirror image on a pillar's tile and on that tile mirrored."""
+    """A robot's mirror image on the mirrored tile, one of Pillar, has the mirrored observation."""
     config = dataclasses.replace(CONFIG, cues=cues, families=("pillar",), unknown_share=0.0)
     task = NavigationTask(config, LOW, 2, seed=0, training=False)
     loco, state, rng = task.locomotion, task.locomotion.world.state, np.random.default_rng(0)
@@ -251,7 +259,7 @@ def test_the_teachers_episodes_move_no_levels():
 
 
 def test_some_episodes_in_training_are_not_told_their_family():
-    """Of 400 episodes of two families a fifth, of either family; in an evaluation all are told."""
+    """A fifth of 400 training episodes hide their family, either of two; in evaluation none do."""
     config = dataclasses.replace(CONFIG, families=("tilt", "rough"), unknown_share=0.2)
     where = columns(high_layout(CONFIG))["family"]
     names = np.tile([SEMANTIC.index("tilt"), SEMANTIC.index("rough")], 10)
@@ -276,7 +284,7 @@ def test_some_episodes_in_training_are_not_told_their_family():
 
 def test_goal_is_seen_in_the_heading_frame(task):
     where = columns(high_layout(CONFIG))["goal"]
-    task.goal[:] = task.locomotion.world.state.position[:, :2] + [0.0, 2.0]  # due north
+    task.goal[:] = task.locomotion.world.state.position[:, :2] + [0.0, 2.0]  # to the world's +y
     yaw = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2, 0.0])
     xy = task.locomotion.world.state.position[:, :2].copy()
     task.locomotion.place(np.arange(5), xy, yaw, np.zeros(5))
@@ -287,7 +295,7 @@ def test_goal_is_seen_in_the_heading_frame(task):
 
 
 def test_probes_see_what_is_ahead(task):
-    # Robot 1 looks at a wall that begins 0.4 m ahead of it.
+    # Robot 1 faces a wall that begins 0.4 m ahead of it.
     state = task.locomotion.world.state
     row = np.flatnonzero(POINTS[:, 0] > 0.45)
     near = np.flatnonzero(POINTS[:, 0] < 0.35)
@@ -306,7 +314,7 @@ def test_probes_see_what_is_ahead(task):
 
 @pytest.mark.parametrize("training", [True, False])
 def test_sensors_are_noisy_in_training_only(training):
-    """What the low policy observes, and the probes."""
+    """Noise is added to the low policy's observation and to the probes, in training only."""
     task = NavigationTask(CONFIG, LOW, 5, seed=3, training=training)
     exact = Locomotion(
         5, task.low_config.robot, task.low_config.physics, task.field, task.low_config.gyro
@@ -328,7 +336,7 @@ def test_sensors_are_noisy_in_training_only(training):
 
 def test_family_is_one_hot(task):
     family = task.observe()[:, columns(high_layout(CONFIG))["family"]]
-    assert np.array_equal(family, np.eye(6)[[0, 1, 2, 3, 3]])  # twice as many leap
+    assert np.array_equal(family, np.eye(6)[[0, 1, 2, 3, 3]])  # Gap is listed twice
 
 
 def test_a_decision_lasts_five_control_steps(task):
@@ -360,7 +368,7 @@ def test_curriculum_moves_levels_and_redraws_tiles():
     task = NavigationTask(config, LOW, 2, seed=0)
     try:
         task.reset(np.arange(2))
-        for _ in range(2):  # two episodes of two decisions: robot 0 reaches, robot 1 does not
+        for _ in range(2):  # two episodes of two decisions; only robot 0 reaches its goal
             task.goal[0] = task.locomotion.world.state.position[0, :2]
             task.goal[1] = task.locomotion.world.state.position[1, :2] + 3.0
             for _ in range(2):
@@ -376,7 +384,7 @@ def test_curriculum_moves_levels_and_redraws_tiles():
 
 @pytest.mark.parametrize("rule", ["uniform", "hardest"])
 def test_levels_without_performance(rule):
-    """Drawn for each episode, or the last; outcomes do not matter."""
+    """Levels are drawn for each episode, or always the hardest; outcomes do not change them."""
     config = dataclasses.replace(
         CONFIG, families=("tilt",), curriculum=rule, levels=4, window=2, threshold=2
     )
@@ -418,16 +426,15 @@ def test_velocities_alone_leave_the_other_commands_at_their_defaults():
     commands = decoder.decode(rng.uniform(-1.0, 1.0, (50, 13)))
     assert (commands[:, 3:12] == default[3:12]).all()
     assert (np.ptp(commands[:, :3], axis=0) > 1.0).all()
-    assert paired(config, low) == config  # as it is read from a policy's file
+    assert paired(config, low) == config  # as when read from a policy's file
     high = dataclasses.replace(low.commands, swing_height=(0.19, 0.19))
     config = paired(HighLevelConfig(behaviour="velocities", commands=high), low)
     assert config.commands.swing_height == (0.19, 0.19)
-    assert config.commands.body_height == (0.0, 0.0)  # within the low policy's bounds
+    assert config.commands.body_height == (0.0, 0.0)  # the default, within the low policy's bounds
 
 
 def test_a_teacher_says_what_can_be_said_of_what_it_does():
-    """Over trenches it pronks; who may only trot at fixed parameters is shown how fast and where
-    to."""
+    """A student limited to trot at fixed parameters is still shown the velocities of a leap."""
     config = dataclasses.replace(CONFIG, families=("gap",), gaits=("trot",), behaviour="velocities")
     task = NavigationTask(config, LOW, 2, seed=0, taught=True, led=6, landing=Landing())
     try:
@@ -453,14 +460,14 @@ def test_robots_begin_spread_over_the_first_levels():
     assert task.curriculum.levels.tolist() == levels
     task.curriculum.push(np.arange(8), np.zeros(8, dtype=bool))
     state = task.state_dict()
-    del state["episodes"], state["curriculum"]  # of a phase before, with levels of its own
+    del state["episodes"], state["curriculum"]  # of a phase before one that sets its own levels
     task.load_state_dict(state)
     assert task.curriculum.levels.tolist() == task.tiles.level.tolist() == levels
     task.close()
 
 
 def test_a_teacher_shows_the_second_way_around_pillars():
-    """As what it differs in from the first, in actions."""
+    """The guidance holds the difference of the second way from the first, in actions."""
     task = NavigationTask(
         dataclasses.replace(CONFIG, families=("pillar",)), LOW, 40, 0, taught=True
     )
@@ -506,7 +513,7 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
             np.testing.assert_allclose(task._actions[0][leads], taught[leads], atol=1e-6)
             assert (task._actions[0][~leads] == 0.25).all()
             task.reset(np.flatnonzero(terminated | truncated))
-        assert led[0] == led[1] == 1.0  # episodes of two decisions; the share is 2/3, 1/3, 0
+        assert led[0] == led[1] == 1.0  # after episodes of two decisions, the share is 2/3, 1/3, 0
         assert 0.45 < led[2] < 0.9 and 0.1 < led[4] < 0.55 and led[6] == led[7] == 0.0
     finally:
         task.close()
@@ -515,8 +522,11 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
 @pytest.mark.parametrize("taught", [False, True])
 @pytest.mark.parametrize("episodes", [True, False])
 def test_the_future_follows_from_the_state(episodes, taught):
-    """That of episodes under way after ``forget``, which then end on the way; that of new ones
-    after ``restart``."""
+    """A task that loads a state continues exactly as the one that saved it.
+
+    With ``episodes`` in the state, it continues those, as the other does after ``forget``; they end
+    during the test. Without, it begins new ones, as the other does after ``restart``.
+    """
     config = dataclasses.replace(CONFIG, families=("rough", "gap"), episode_seconds=0.8)
     first = NavigationTask(config, LOW, 3, seed=1, taught=taught, led=15)
     second = NavigationTask(config, LOW, 3, seed=1, taught=taught, led=15)
@@ -527,7 +537,7 @@ def test_the_future_follows_from_the_state(episodes, taught):
             first.step(rng.uniform(-1, 1, (3, 13)))
         first._next_push[0] = 0
         first._pushes.push(first.locomotion.world, first.elapsed, np.ones(first.num_robots))
-        first.tiles.episodes[:] = 5  # so the next ones bring new tiles
+        first.tiles.episodes[:] = 5  # so that the next episodes bring new tiles
         state = first.state_dict()
         if episodes:
             first.forget()
@@ -556,7 +566,7 @@ def test_the_future_follows_from_the_state(episodes, taught):
 
 
 def test_a_robot_that_blows_up_in_a_decision_is_seen_in_the_observation(task):
-    """Its low policy has no action then; the decision goes on for the others."""
+    """Only its own observation is not finite; the decision continues for the other robots."""
     task.reset(np.arange(5))
     task.locomotion.world.strength[1] = np.nan
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Jobs shared among processes: in order, and no silence when one of them dies."""
+"""Jobs shared among processes: results come in order, and a process that dies is reported."""
 
 import os
 import time
@@ -10,13 +10,13 @@ from tdgc.parallel.worker import WorkerError
 
 
 def reciprocal(number: float) -> float:
-    time.sleep(0.2 if number == 1.0 else 0.0)  # the first is the last to be ready
+    time.sleep(0.2 if number == 1.0 else 0.0)  # the first job finishes last
     return 1.0 / number
 
 
 def die(number: int) -> int:
     if number == 2:
-        os._exit(9)  # as the kernel ends a process that takes too much memory
+        os._exit(9)  # as when the kernel kills a process that takes too much memory
     return number
 
 
@@ -35,7 +35,7 @@ def test_what_a_job_raises_is_raised() -> None:
 
 
 def test_a_process_that_dies_is_told() -> None:
-    with pytest.raises(WorkerError, match=r"^a process died, perhaps for want of memory$"):
+    with pytest.raises(WorkerError, match=r"^a process died, perhaps out of memory$"):
         list(run_jobs(die, range(4), 2))
 
 

@@ -1,4 +1,4 @@
-"""Leaps: where feet land on the way over trenches, and what is measured of a low policy."""
+"""Leaps: planned landings over trenches, and the measured landing of a low policy."""
 
 import numpy as np
 import pytest
@@ -30,8 +30,11 @@ LANDING = Landing(-0.02, 0.08)
 def land(
     trenches: Array, clock: float = 0.0, x: float = 0.75, choice: str = "steps"
 ) -> tuple[list[float], list[float]]:
-    """Places of front and rear feet of a point that is asked to leap at SPEED, decided ten times a
-    second; it falls a little short of it, as low policies do."""
+    """Where the front and rear feet of a simulated point land, in m, when it leaps over trenches.
+
+    It is commanded SPEED and moves at 0.95 of it, as low policies do. ``choice`` names the method
+    of ``LeapPlan`` that decides, ten times a second.
+    """
     speed = 0.95 * SPEED
     plan = LeapPlan(1, RANGES)
     plan.look(0, trenches, LANDING.spread)
@@ -58,8 +61,11 @@ def land(
 @pytest.mark.parametrize("choice", ["steps", "lesson"])
 @pytest.mark.parametrize("level", [4, 8, 10])
 def test_planned_landings_miss_the_trenches(level: int, choice: str) -> None:
-    """Of 20 tiles a level, from any phase of the gait: of a hundred feet 97 at least 1 cm from each
-    lip, and 99 at most half their radius beyond one."""
+    """Over 97 % of feet land at least 1 cm from a trench, and over 99 % at most 1 cm inside one.
+
+    1 cm is half a foot's radius. The feet are those of 20 tiles per level, each started at another
+    phase of the gait.
+    """
     feet = []
     for seed in range(20):
         trenches = make_tile("gap", level / 10, np.random.default_rng(seed)).features.trenches
@@ -72,14 +78,17 @@ def test_planned_landings_miss_the_trenches(level: int, choice: str) -> None:
 
 
 def test_speeding_up() -> None:
-    """From rest to 95 % of 1.2 m/s, two thirds of it in 0.3 s; what is faster stays so."""
+    """From rest a robot reaches 95 % of 1.2 m/s, two thirds of it (1 - 1/e) in 0.3 s.
+
+    A faster robot keeps its speed.
+    """
     speed = np.array([0.0, 1.14, 1.3])
     way, then = speed_up(speed, 1.2, 0.3)
     np.testing.assert_allclose(then, [1.14 * (1 - np.exp(-1.0)), 1.14, 1.3])
     np.testing.assert_allclose(way[1:], 0.3 * speed[1:])
     _, nearly = speed_up(speed, 1.2, 3.0)
     np.testing.assert_allclose(nearly, [1.14, 1.14, 1.3], atol=1e-3)
-    steps, v = 0.0, np.zeros(1)  # the way is what ever smaller steps sum up to
+    steps, v = 0.0, np.zeros(1)  # the distance is the sum of small steps
     for _ in range(300):
         _, after = speed_up(v, 1.2, 0.001)
         steps, v = steps + 0.001 * 0.5 * (v[0] + after[0]), after
@@ -102,7 +111,7 @@ def test_risk_of_a_foothold() -> None:
 
 
 def test_a_slow_robot_is_timed_for_the_speed_of_a_leap() -> None:
-    """At 2 Hz from rest robots are thrown down."""
+    """A slow robot's stride is timed for ``SPEED``: robots that leap at 2 Hz from rest fall."""
     plan = LeapPlan(1, RANGES)
     one, row = np.ones(1), np.zeros(1, dtype=int)
     motion = Motion(one, 0.1 * one, SPEED * one, 0.0 * one, 3.0 * one, STRIDE * one)
@@ -111,8 +120,11 @@ def test_a_slow_robot_is_timed_for_the_speed_of_a_leap() -> None:
 
 
 def test_what_is_imitated_depends_smoothly_on_the_speed() -> None:
-    """Best stance lengths jump; over speeds 1 cm/s apart the squares of the smooth ones' changes
-    are four fifths as large, and of frequencies about as large."""
+    """The means of ``lesson`` vary less with speed than the best choices, whose length jumps.
+
+    Between speeds 1 cm/s apart, the mean squared change is below 0.8 of the best choice's for the
+    stance length, and below 1.1 of it for the frequency.
+    """
     trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
     plan, speeds = LeapPlan(1, RANGES), np.arange(0.9, 1.3, 0.01)
     plan.look(0, trenches, LANDING.spread)
@@ -136,8 +148,10 @@ def test_what_is_imitated_depends_smoothly_on_the_speed() -> None:
 
 
 def test_prices_of_strides() -> None:
-    """What the teacher does costs next to nothing, and in front of a trench some strides cost a
-    fall; what others cost depends on the frequency and the stance length together."""
+    """The taught stride costs next to nothing; at a trench others cost over 1, a foot on the lip.
+
+    The cheapest frequency depends on the stance length, so prices depend on both together.
+    """
     trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
     plan = LeapPlan(1, RANGES)
     plan.look(0, trenches, LANDING.spread)
@@ -176,7 +190,7 @@ def test_landing_of_the_shipped_low_policy() -> None:
 
 
 class Flail:
-    """A low policy that throws its legs about."""
+    """A low policy that commands the same random joint targets at every step."""
 
     def predict(self, observation: np.ndarray) -> tuple[np.ndarray, None]:
         rng = np.random.default_rng(0)
@@ -190,8 +204,10 @@ def test_a_low_policy_that_falls_has_no_landing() -> None:
 
 @pytest.mark.parametrize("choice", ["steps", "lesson"])
 def test_who_pushes_off_has_decided(choice: str) -> None:
-    """From two fifths of the cycle on the stride stays as it is, and any imitation of it is free of
-    prices; before, some robots in front of a trench change it."""
+    """From 0.4 of the cycle on, the stride is kept and all prices are zero.
+
+    Before that, some robots in front of a trench change their stride.
+    """
     trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
     plan = LeapPlan(1, RANGES)
     plan.look(0, trenches, LANDING.spread)

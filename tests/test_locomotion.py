@@ -1,4 +1,4 @@
-"""The executor: what the low policy sees, in which frame and sign, and its left-right mirror."""
+"""``Locomotion``: the low policy's observation, its frames and signs, acting, and the mirror."""
 
 import dataclasses
 import math
@@ -24,7 +24,7 @@ ROBOT, PHYSICS = RobotConfig(), PhysicsConfig(substeps=4)
 NOMINAL = nominal_pose(ROBOT)
 
 
-#: A solver that stops early solves one side before the other; one that converges does not care.
+#: The solver takes one side before the other; the order does not matter once it has converged.
 CONVERGED = PhysicsConfig(solver_iterations=300)
 
 
@@ -40,7 +40,7 @@ def standing(num: int = 1, gyro: bool = False, physics: PhysicsConfig = PHYSICS)
 
 @pytest.fixture
 def loco() -> Iterator[Locomotion]:
-    """Two robots that stand, with a gyro."""
+    """Two standing robots, with a gyro."""
     made = standing(2, gyro=True)
     yield made
     made.world.close()
@@ -84,7 +84,7 @@ def test_observation_of_a_robot_that_stands(loco: Locomotion) -> None:
 
 
 def test_gravity_is_in_the_body_frame(loco: Locomotion) -> None:
-    """Nose down brings gravity to the front, left side up to the right, heading does nothing."""
+    """Nose down turns gravity forward, left side up turns it right; heading has no effect."""
     state = loco.world.state
     state.quaternion[0] = quaternion(0.0, 0.3, 2.0)
     state.quaternion[1] = quaternion(0.2, 0.0, -1.0)
@@ -180,13 +180,13 @@ def test_act_clips_and_keeps_histories(loco: Locomotion) -> None:
     for age, action in enumerate([-4.0, 1.0, 0.0]):
         expected = np.clip(poses[age] + action * scale, *limits)
         np.testing.assert_allclose(loco.targets[age], expected, atol=1e-12)
-    # Two steps, the first at 3.5 Hz, the second 0.07 of two cycles closer to 3 Hz.
+    # The first step runs at 3.5 Hz; the second is 0.07 of two cycles on the way to 3 Hz.
     ran = 0.02 * 3.5 + 0.02 * (3.0 + 0.965 * 0.5)
     assert loco.clock.clock.tolist() == pytest.approx([ran, ran])
 
 
 def test_a_gait_begins_no_slower_than_its_start(loco: Locomotion) -> None:
-    """3.5 Hz at first, as slow as asked after two cycles; clock and observation go by it."""
+    """A gait slows from 3.5 Hz to its command in two cycles, for the clock and the observation."""
     loco.command[:, INDEX["frequency"]] = [2.0, 3.8]
     loco.observe()
     for cycles, expected in ((0.0, 3.5), (0.5, 3.125), (1.0, 2.75), (2.0, 2.0), (9.0, 2.0)):
@@ -200,18 +200,18 @@ def test_a_gait_begins_no_slower_than_its_start(loco: Locomotion) -> None:
     before = loco.clock.clock.copy()
     loco.act(np.zeros((2, 12)))
     assert loco.clock.clock - before == pytest.approx([0.02 * 2.75, 0.02 * 3.8])
-    loco.command[0, 12:] = gait_embedding(GAITS.index("pronk"))  # from the top, for one of them
+    loco.command[0, 12:] = gait_embedding(GAITS.index("pronk"))  # a new gait starts over
     loco.observe()
     assert loco.executed()[:, INDEX["frequency"]].tolist() == [3.5, 3.8]
 
 
 def test_the_pose_is_never_stale(loco: Locomotion) -> None:
-    """Whatever it follows from is changed in place or by a step: it is as derived anew."""
+    """After its inputs change, in place or by a step, the pose equals one computed afresh."""
 
     def fresh() -> Array:
         geometry, command = loco.world.state.geometry, loco.executed()
         frequency, duty = command[:, INDEX["frequency"]], command[:, INDEX["duration"]]
-        # The middle of the coming step, and 0.6 / 20 s later, which joints trail their targets by.
+        # The middle of the coming step, and later by the lag of the joints, kd / kp = 0.6 / 20 s.
         now, ahead = (
             foot_phases((loco.clock.clock + time * frequency) % 1.0, command[:, 12:], duty)
             for time in (0.01, 0.01 + 0.03)
@@ -272,7 +272,7 @@ def test_place_stands_robots_on_the_ground_and_forgets(loco: Locomotion) -> None
 def draw_ten_times(
     loco: Locomotion, config: RandomisationConfig, rng: np.random.Generator
 ) -> list[Array]:
-    """Friction, payload, strength, latency and joint offset, the last draw last."""
+    """Draw ten times; return friction, payload, strength, latency and joint offset of each draw."""
     draws = []
     for _ in range(10):
         loco.randomise(np.arange(loco.num_robots), config, rng)
@@ -351,8 +351,11 @@ def test_action_mirror_swaps_legs_and_flips_hips() -> None:
 
 
 def mirror_commands(loco: Locomotion, rng: np.random.Generator, gait: int) -> None:
-    """Commands for robot 0, their mirror image for robot 1, and clocks that fit: where left and
-    right are half a cycle apart, changing sides is waiting half a cycle."""
+    """Set random commands for robot 0, their mirror image for robot 1, and matching clocks.
+
+    In gaits whose left and right legs are half a cycle apart, swapping sides is the same as
+    shifting the clock by half a cycle.
+    """
     config = LowLevelConfig().commands
     bounds = np.array(dataclasses.astuple(config))
     loco.command[0, :12] = rng.uniform(bounds[:, 0], bounds[:, 1])
@@ -365,8 +368,10 @@ def mirror_commands(loco: Locomotion, rng: np.random.Generator, gait: int) -> No
 
 @pytest.mark.parametrize("gait", range(4))
 def test_a_mirrored_robot_sees_a_mirrored_world(gait: int) -> None:
-    """Two robots in Bullet, the second the first one's image: for 40 steps of random actions what
-    the second sees, the critic's part included, is the mirror image of what the first sees."""
+    """A robot's mirror image in Bullet has mirrored observations, including the critic's part.
+
+    It keeps them, and equal rewards, over 40 steps of random actions.
+    """
     config = LowLevelConfig(gyro=True, command_seconds=0.0, physics=CONVERGED)
     task = LowLevelTask(config, 2, seed=0, training=False)
     loco, rng = task.locomotion, np.random.default_rng(gait)
@@ -393,9 +398,9 @@ def test_a_mirrored_robot_sees_a_mirrored_world(gait: int) -> None:
 
 
 def slanted_stairs() -> tuple[Tile, Tile]:
-    """Stairs on a lateral slope, level in no direction, and their image about the middle line.
+    """Stairs on a lateral slope, level in no direction, and their image about the centre line.
 
-    Every cell is plane, so the triangles that Bullet makes of it have no handedness.
+    Every cell is planar, so it does not matter along which diagonal Bullet divides it.
     """
     tile = make_tile("stair", 0.3, np.random.default_rng(0))
     y = np.linspace(-0.5, 0.5, tile.heights.shape[1]) * TILE_SIZE
@@ -406,7 +411,10 @@ def slanted_stairs() -> tuple[Tile, Tile]:
 
 
 def test_the_critic_sees_a_mirrored_terrain() -> None:
-    """The second robot's state is set to the image of the first one's, which walks on stairs."""
+    """On mirrored stairs, a robot in the mirrored state has the mirrored observation.
+
+    The first robot acts at random on stairs; the second is set to its mirror image at each step.
+    """
     config = LowLevelConfig(terrain="tiles", families=("stair",), command_seconds=0.0)
     task = LowLevelTask(config, 2, seed=0, training=False)
     assert task.field is not None
@@ -436,7 +444,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
         first, second = task.observe()
         np.testing.assert_allclose(second, mirrored(first, ALL), atol=1e-4)
     critic, where = first, columns((*loco.layout, *CRITIC_LAYOUT))
-    # What is compared is not all alike, neither left to right nor along x.
+    # The compared observation varies from left to right and along x.
     probes = critic[where["terrain"]].reshape(5, 3)
     assert np.abs(probes[:, 0] - probes[:, 2]).max() > 0.04 and np.ptp(probes[:, 1]) > 0.2
     assert np.ptp(critic[where["foot_height"]]) > 0.005
@@ -446,7 +454,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
 
 
 def test_phases_follow_the_clock_of_a_placed_robot() -> None:
-    """Before any step: what the high policy sees first is this episode's clock."""
+    """``place`` updates the phases, so the high policy's first observation shows the new clock."""
     loco = Locomotion(2, RobotConfig(), PhysicsConfig(), None)
     loco.place(np.arange(2), np.array([[0.0, 0.0], [5.0, 0.0]]), np.zeros(2), np.array([0.1, 0.35]))
     # Trot with a duty factor of one half: FL and RR half a cycle ahead of FR and RL.
@@ -462,7 +470,10 @@ def test_phases_follow_the_clock_of_a_placed_robot() -> None:
 def test_feet_rise_without_a_policy_only_where_the_pose_carries_the_robot(
     walks: bool, lowest: float, highest: float
 ) -> None:
-    """Asked for 8 cm in trot at 2.5 Hz, in its second and third cycle."""
+    """With zero actions, feet rise by 2.5 cm or more only if q0 walks.
+
+    The command is a trot at 2.5 Hz with a swing height of 8 cm; its first cycle is not counted.
+    """
     made = Locomotion(1, dataclasses.replace(ROBOT, commanded_gait=walks), PHYSICS, None)
     made.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
     made.command[:, INDEX["frequency"]] = 2.5

@@ -1,4 +1,4 @@
-"""The execution-level MDP: episodes, commands, pushes, levels, and a future that repeats."""
+"""The execution-level MDP: observation, reward, episodes, commands, levels and exact resume."""
 
 import dataclasses
 import json
@@ -47,13 +47,13 @@ def begin(config: LowLevelConfig, robots: int = 1, training: bool = False) -> Lo
 
 
 def put(task: LowLevelTask, robot: int, local_xy: tuple[float, float], yaw: float = 0.0) -> None:
-    """A robot at a point of its tile's frame."""
+    """Place a robot at a point given in its tile's frame."""
     assert task.field is not None
     xy = task.field.origin([robot], 0) + np.array([local_xy])
     task.locomotion.place(np.array([robot]), xy, np.array([yaw]), np.zeros(1))
 
 
-# ------------------------------------------------------------------ Gymnasium's face
+# ------------------------------------------------------------------ Gymnasium interface
 
 
 @pytest.mark.parametrize("config", [PLANE, TILES], ids=["plane", "tiles"])
@@ -104,7 +104,7 @@ def test_an_action_that_is_not_finite(value: float) -> None:
 
 
 def test_observation_of_actor_and_critic() -> None:
-    """Sizes follow from the terms, without a robot."""
+    """The spaces follow from the configuration alone; without the gyro they lose its 3 values."""
     assert width(CRITIC_LAYOUT) == 40
     without = low_spaces(dataclasses.replace(PLANE, gyro=False))[0]
     assert without.shape == (127,)
@@ -133,7 +133,11 @@ def critic(task: LowLevelTask) -> dict[str, Array]:
 
 
 def test_what_the_critic_sees_of_a_known_state() -> None:
-    """Facing left, going forward, turning left, 5 cm high, one foot up, weak and loaded."""
+    """The critic's terms match values worked out by hand, scaled as in ``CRITIC_LAYOUT``.
+
+    The robot faces +y and turns left, 5 cm above its standing height. It moves forward at 0.6 m/s
+    and to the left at 0.2 m/s. Two feet press with more than 1 N; it is weak and loaded.
+    """
     task = begin(PLANE)
     loco, state = task.locomotion, task.locomotion.world.state
     state.position[0] = [3.0, 1.0, 0.35]
@@ -160,7 +164,7 @@ def test_what_the_critic_sees_of_a_known_state() -> None:
 
 
 def test_the_critic_sees_a_step_ahead() -> None:
-    """A riser 0.4 m ahead of the trunk is under the front probes only, in any heading."""
+    """A 10 cm step 0.4 m ahead lifts the front row of probes only; facing away, it lifts none."""
     task = begin(TILES)
     assert task.field is not None
     field, n = task.field, 161
@@ -179,7 +183,7 @@ def test_the_critic_sees_a_step_ahead() -> None:
 
 
 def test_reset_gives_a_fresh_observation() -> None:
-    """What is left of a fall does not show in the first observation after it."""
+    """The first observation after a reset shows no trace of the fall before it."""
     task = begin(PLANE)
     fresh = {k: v.copy() for k, v in critic(task).items()}
     task.locomotion.world.strength[:] = 0.0
@@ -203,7 +207,7 @@ def test_reward_of_a_step_is_that_of_its_terms() -> None:
     pose = task.locomotion.pose().copy()
     before = task.locomotion.world.state.qd.copy()
     actions = np.random.default_rng(0).normal(size=(2, 12))
-    actions[:, 2::3] = -np.abs(actions[:, 2::3])  # calves bend, away from their nearer limit
+    actions[:, 2::3] = -np.abs(actions[:, 2::3])  # calves bend away from their nearer limit
     reward, _, _ = task.step(actions)
     stats, weights = task.take_stats(), PLANE.rewards
     terms = {key[5:]: value for key, value in stats.items() if key.startswith("term/")}
@@ -218,7 +222,8 @@ def test_reward_of_a_step_is_that_of_its_terms() -> None:
     assert terms["joint_torques"] == pytest.approx(weights.joint_torques * (state.torque**2).sum())
     assert stats["reward"] == pytest.approx(reward.sum())
     assert (reward > 0.0).all() and (reward < 0.07).all()
-    # The sum: two robots alike would make the sum of the terms that of one.
+    # Statistics are sums over robots and the total is not linear in them, so check one robot. The
+    # factor 0.5 is ``walking_penalty``.
     task.close()
     task = begin(PLANE)
     reward, _, _ = task.step(actions[:1])
@@ -237,7 +242,7 @@ def test_statistics_of_a_run() -> None:
     steps = [sums[f"gait/{gait}/steps"] for gait in ("trot", "pronk", "pace", "bound")]
     assert sum(steps) == 12
     task.step(still(task))
-    assert task.take_stats()["steps"] == 4  # only what came since
+    assert task.take_stats()["steps"] == 4  # since the last call
     values = summarise({**sums, "falls": 3.0})
     assert values["reward/total"] == pytest.approx(sums["reward"] / 12)
     assert values["falls_per_minute"] == pytest.approx(3 / (12 * 0.02 / 60))
@@ -249,7 +254,7 @@ def test_statistics_of_a_run() -> None:
     task.close()
 
 
-# ------------------------------------------------------------------ how episodes end
+# ------------------------------------------------------------------ ends of episodes
 
 
 def test_a_robot_without_strength_falls() -> None:
@@ -283,7 +288,7 @@ def test_a_robot_in_a_trench_has_failed_and_one_on_a_step_has_not() -> None:
     trench = task.field.features[0, 0].trenches[0].mean()
     risers = task.field.features[1, 0].risers
     up, top = len(risers) // 2, 0.15 * len(risers) / 2
-    stairs = 161 * 0.05 + risers[up - 1 : up + 1, 0].mean()  # the landing
+    stairs = 161 * 0.05 + risers[up - 1 : up + 1, 0].mean()  # the landing between the flights
     state = world.state
     state.position[:] = [[trench, 2.0, 0.14], [stairs, 2.0, top + 0.3]]
     assert world.ground_height(np.array([trench]), np.array([2.0]))[0] < -0.5
@@ -323,7 +328,7 @@ def test_a_fall_at_the_last_step_is_a_fall() -> None:
 
 @pytest.mark.parametrize("spot", [(0.01, 4.0), (7.99, 4.0), (0.75, 2.01), (0.75, 5.99)])
 def test_leaving_the_tile_truncates(spot: tuple[float, float]) -> None:
-    """Training tiles are 4 m wide; robots are pushed out over each border."""
+    """A robot pushed over any border of its tile, 8 m long and cropped to 4 m, is truncated."""
     task = begin(dataclasses.replace(TILES, families=("stair",)), 2)
     put(task, 1, spot)
     out = np.sign(np.array(spot) - [4.0, 4.0]) * (np.abs(np.array(spot) - 4.0) > [3.9, 1.9])
@@ -336,13 +341,13 @@ def test_leaving_the_tile_truncates(spot: tuple[float, float]) -> None:
 # ------------------------------------------------------------------ commands and pushes
 
 
-def test_commands_are_drawn_anew_every_five_seconds() -> None:
+def test_commands_are_drawn_anew_at_every_interval() -> None:
     task = begin(PLANE, 3)
     task.episodes.elapsed[:] = [0, 248, 100]
     first = task.locomotion.command.copy()
     task.step(still(task))
     assert (task.locomotion.command == first).all()
-    task.step(still(task))  # the second robot is 250 steps old
+    task.step(still(task))  # 250 steps, twice the interval, into the second episode
     changed = (task.locomotion.command != first).any(axis=1)
     assert changed.tolist() == [False, True, False]
     task.step(still(task))
@@ -351,7 +356,7 @@ def test_commands_are_drawn_anew_every_five_seconds() -> None:
 
 
 def test_a_reset_leaves_the_other_robots_alone() -> None:
-    """Even those whose commands were drawn in this very step."""
+    """A reset does not affect other robots, even those whose commands were drawn in that step."""
     task = begin(PLANE, 3, training=True)
     task.episodes.elapsed[:] = [10, 249, 500]
     task.step(still(task))
@@ -401,7 +406,7 @@ def test_a_crossing_robot_is_sent_to_its_waypoint(yaw: float) -> None:
 
 
 def test_crossing_velocities_keep_their_direction_within_the_ranges() -> None:
-    """Going sideways at 1 m/s is asked for at the 0.6 m/s that vy allows."""
+    """A crossing at 1 m/s that leads sideways is commanded at 0.6 m/s, the bound of vy."""
     task = begin(TILES)
     assert task.field is not None
     task.episodes.crossing[:], task.episodes.facing[:], task.episodes.speed[:] = True, 0.0, 1.0
@@ -436,18 +441,18 @@ def test_an_episode_ends_with_the_crossing() -> None:
 
 
 def test_crossing_robots_face_where_they_are_asked_to() -> None:
-    """So that the first command asks for no more than a small turn."""
+    """Robots start at the heading commanded for their crossing, so they turn little at first."""
     task = LowLevelTask(TILES, 10, seed=3, training=False)
     task.reset(np.arange(10))
     crossing = task.episodes.crossing
     assert 0.5 < crossing.mean() <= 1.0
     turning = np.abs(task.locomotion.command[crossing, INDEX["yaw_rate"]])
-    assert turning.max() < 0.85  # 0.5 rad of the start's yaw, 0.3 of the goal's bearing
+    assert turning.max() < 0.85  # yaw at the start +-0.5 rad, bearing of the goal +-0.3 rad
     task.close()
 
 
 class Pushes:
-    """Notes the pushes of a world and lets them happen."""
+    """Records the pushes of a task's robots and carries them out."""
 
     def __init__(self, task: LowLevelTask) -> None:
         self.task, self.seen = task, []  # type: ignore[var-annotated]
@@ -507,7 +512,7 @@ def test_each_robot_has_a_tile_of_its_family_and_level() -> None:
         tile = shallow(
             make_tile(family, level / 10, tile_rng(7, family, level, i - 1)), level, 0.05
         )
-        crop = slice(40, 121)  # 2 m at either side
+        crop = slice(40, 121)  # cropped by 2 m on either side
         assert (task.field.heights[161 * i : 161 * (i + 1)] == tile.heights[:, crop]).all()
     for i in (0, 5):
         assert (task.field.heights[161 * i : 161 * (i + 1)] == 0.0).all()
@@ -515,7 +520,10 @@ def test_each_robot_has_a_tile_of_its_family_and_level() -> None:
 
 
 def test_a_new_level_is_a_new_tile() -> None:
-    """At the next reset, in Bullet too: a stair of level 7 has steps of 11.4 cm."""
+    """A new level takes effect at the robot's next reset, in Bullet too.
+
+    Level 7 of Stair has steps of 11.4 cm.
+    """
     task = LowLevelTask(dataclasses.replace(TILES, families=("stair",)), 2, seed=0)
     task.level[:] = 0
     task.reset(np.arange(2))
@@ -554,7 +562,7 @@ def test_robots_of_flat_tiles_are_free_and_start_in_the_middle() -> None:
 
 
 def test_penalties_fall_as_the_commands_of_a_gait_grow() -> None:
-    """From all of them to half, each gait on its own."""
+    """Each gait's share of the penalties falls from 1 to 0.5 as its velocity ranges grow."""
     task = begin(PLANE, 4)
     task.locomotion.command[:, 12:] = gait_embedding([0, 1, 2, 3])
     task.commands.share[:] = [0.4, 0.7, 0.85, 1.0]
@@ -563,7 +571,7 @@ def test_penalties_fall_as_the_commands_of_a_gait_grow() -> None:
 
 
 def test_penalties_count_least_on_relief() -> None:
-    """The same still step on level 0 of Tilt, which is flat, and on a flat tile."""
+    """The same step has 0.4 of the penalties on Tilt, flat at level 0, and 0.5 on a flat tile."""
     quiet = RandomisationConfig(scale=0.0)
     rewarded = {}
     for family in ("flat", "tilt"):
@@ -579,12 +587,12 @@ def test_penalties_count_least_on_relief() -> None:
         task.close()
     positive = 0.02 * sum(v for v in terms.values() if v > 0.0)
     share = math.log(rewarded["tilt"] / positive) / math.log(rewarded["flat"] / positive)
-    assert share == pytest.approx(0.4 / 0.5, rel=1e-6)  # commands are whole outside training
+    assert share == pytest.approx(0.4 / 0.5, rel=1e-6)  # full ranges outside training
 
 
 def test_leaps_grow_as_fast_as_pronk_does() -> None:
     task = begin(dataclasses.replace(TILES, families=("gap",)), 400, training=True)
-    assert task.commands.share[PRONK] == 0.4  # as training begins
+    assert task.commands.share[PRONK] == 0.4  # at the start of training
     speed = task.episodes.speed[task.episodes.leaping]
     assert 0.4 <= speed.min() and speed.max() <= 0.48
     task.close()
@@ -599,13 +607,13 @@ def test_most_crossings_of_trenches_leap() -> None:
     assert 0.75 < leaps[gap & task.episodes.crossing].mean() < 0.95
     assert (task.episodes.facing[leaps] == 0.0).all()
     command = task.locomotion.command[leaps]
-    # From rest about as for strides of 0.39 m at 1.2 m/s, and never at the slow end of 2 Hz.
+    # From rest, timed about as for strides of 0.39 m at 1.2 m/s, and never near the lowest 2 Hz.
     frequency = command[:, INDEX["frequency"]]
     assert frequency.min() > 2.4 and np.median(frequency) == pytest.approx(1.2 / 0.39, abs=0.2)
     assert (command[:, INDEX["duration"]] == DURATION).all()
     assert (command[:, INDEX["swing_height"]] <= 0.07).all()
     speed = np.hypot(*command[:, :2].T)
-    # Sideways to the goal, but facing across the trenches.
+    # They move sideways as needed to reach the goal, but face across the trenches.
     turn, yaw = command[:, INDEX["yaw_rate"]], task.locomotion.world.state.yaw[leaps]
     np.testing.assert_allclose(turn, -yaw, atol=1e-9)
     assert speed.min() > 0.5 and speed.max() <= 1.2 + 1e-9
@@ -637,7 +645,7 @@ def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> 
 
 
 def test_pitch_follows_the_slope_of_a_crossing() -> None:
-    """Nose up on stairs that rise under the robot, by the share that was drawn."""
+    """On rising stairs, the commanded pitch is nose up by the drawn share of the slope."""
     config = dataclasses.replace(TILES, families=("stair",))
     task = begin(config, 2)
     assert task.field is not None
@@ -653,7 +661,7 @@ def test_pitch_follows_the_slope_of_a_crossing() -> None:
     put(task, 1, (risers[2:4, 0].mean(), 4.0))
     task.ground = measure_ground(task.locomotion)
     slope = task.ground.slope()[0]
-    assert 0.25 < slope < 0.6  # 15 cm in 25 to 40
+    assert 0.25 < slope < 0.6  # 15 cm steps on treads of 25 to 40 cm
     task.crossings.steer(task.locomotion, task.ground)
     pitch = task.locomotion.command[:, INDEX["pitch"]]
     np.testing.assert_allclose(pitch, [0.05 - 0.5 * slope, 0.05])
@@ -673,7 +681,10 @@ def ended(
     local_x: float, *, reached: bool = False, crossing: bool = True, level: int = 5,
     elapsed: int = 999, began: int = 0, falls: bool = False, training: bool = True,
 ) -> int:  # fmt: skip
-    """Level of a robot after a step that ends its episode, unless ``elapsed`` says otherwise."""
+    """Put a robot into the given state and return its level after one step.
+
+    With the default ``elapsed``, this step is the last of the episode.
+    """
     quiet = RandomisationConfig(scale=0.0)
     config = dataclasses.replace(TILES, families=("stair",), randomisation=quiet)
     task = LowLevelTask(config, 1, seed=0, training=training)
@@ -706,7 +717,7 @@ def test_promotion() -> None:
 
 def test_demotion() -> None:
     assert ended(3.9) == 4
-    assert ended(4.1) == 5  # more than half of the way
+    assert ended(4.1) == 5  # more than half of the tile
     assert ended(3.9, elapsed=500) == 5
     assert ended(3.9, elapsed=500, falls=True) == 4
     assert ended(4.1, elapsed=500, falls=True) == 5
@@ -715,7 +726,10 @@ def test_demotion() -> None:
 
 
 def test_half_an_episode_is_no_reason_for_demotion() -> None:
-    """After ``restart`` episodes begin at any age; those cut short say nothing of a level."""
+    """An episode that began late demotes a robot only if it falls, not if time runs out.
+
+    After ``restart``, episodes begin at a random ``elapsed``; the time left may be too short.
+    """
     assert ended(3.9, began=600) == 5
     assert ended(3.9, began=600, falls=True) == 4
     assert ended(2.0, began=600, reached=True) == 6
@@ -734,7 +748,7 @@ def test_leaving_a_tile_early_neither_promotes_nor_demotes() -> None:
 
 
 def live(task: LowLevelTask, steps: int) -> Array:
-    """(steps, M, n) of observations, rewards and flags, with resets as a worker does them."""
+    """Act at random and reset as a worker does: (steps, M, n) observations, rewards and flags."""
     rng, rows = np.random.default_rng(1), []
     for _ in range(steps):
         reward, terminated, truncated = task.step(rng.normal(0.0, 1.5, (task.num_robots, 12)))
@@ -748,7 +762,7 @@ def live(task: LowLevelTask, steps: int) -> Array:
 
 
 def flat(state: State) -> dict[str, Any]:
-    """Arrays of a state by their place in it, as JSON has them."""
+    """A state as JSON values: its arrays as lists, named by their place in it, and the rest."""
     arrays: dict[str, Any] = {}
     rest = split(state, "", arrays)
     return {"rest": rest, **{name: array.tolist() for name, array in arrays.items()}}
@@ -756,8 +770,8 @@ def flat(state: State) -> dict[str, Any]:
 
 @pytest.mark.parametrize("config", [PLANE, TILES], ids=["plane", "tiles"])
 def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
-    """In the middle of episodes, a moment after a push and with contacts; to the last bit."""
-    config = dataclasses.replace(config, episode_seconds=1.0)  # some end on the way
+    """A state taken mid-episode, in contact and right after a push, continues bit for bit."""
+    config = dataclasses.replace(config, episode_seconds=1.0)  # some end during the test
     task = LowLevelTask(config, 3, seed=5)
     task.restart()
     task.level[:] = [3, 1, 0]
@@ -778,7 +792,7 @@ def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
     assert flat(state) == kept  # a state is a copy
 
     other = LowLevelTask(config, 3, seed=5)
-    for _ in range(2):  # it may have gone anywhere before
+    for _ in range(2):  # whatever the task did before loading
         other.load_state_dict(state)
         np.testing.assert_array_equal(live(other, 60), expected)
         assert flat(other.state_dict()) == flat(task.state_dict())
@@ -787,7 +801,7 @@ def test_episodes_go_on_from_a_state(config: LowLevelConfig) -> None:
 
 
 def test_planned_leaps_go_on_from_a_state() -> None:
-    """Their plans are older than what is known of landings when the state is taken."""
+    """Leaps keep plans that are older than the landing estimate when the state is taken."""
     pronk = dataclasses.replace(TILES.crossing, share=1.0, trench_gaits=(0.0, 1.0, 0.0, 0.0))
     config = dataclasses.replace(TILES, families=("gap",), crossing=pronk)
     task, other = (LowLevelTask(config, 3, seed=5) for _ in range(2))
@@ -817,7 +831,7 @@ def test_velocities_of_a_crossing_stay_within_their_bounds() -> None:
 
 
 def test_the_least_of_a_workers_robots_is_on_tiles() -> None:
-    """Of two robots and one."""
+    """With 0.99 of the robots on the plane, at least one is on tiles: of two robots, and of one."""
     for robots, groups in ((2, [1, 1]), (1, None)):
         task = make_task((PLANE, TILES), 0.99, robots, 0)
         if groups is None:
@@ -829,7 +843,7 @@ def test_the_least_of_a_workers_robots_is_on_tiles() -> None:
 
 
 def test_a_checkpoint_names_what_it_holds() -> None:
-    """Runs are resumed by later versions, so names, sizes and kinds of numbers stay."""
+    """Later versions resume from a state, so names, shapes and dtypes are fixed."""
     task = begin(TILES, 3, training=True)
     state = task.state_dict()
     episodes = state.pop("episodes")
@@ -852,7 +866,10 @@ def test_a_checkpoint_names_what_it_holds() -> None:
 
 
 def test_new_episodes_begin_from_a_state_without_any() -> None:
-    """As where a phase of a run ends, with lists for arrays."""
+    """A state without ``episodes``, as between phases of a run, acts like ``restart``.
+
+    Its arrays may be lists.
+    """
     task, other = (LowLevelTask(PLANE, 3, seed=5) for _ in range(2))
     task.level[:] = [3, 1, 0]
     task.commands.share[1] = 0.65
@@ -909,11 +926,11 @@ def test_seeds_differ() -> None:
 
 
 def test_tilt_a_gait_cycle_ago() -> None:
-    """At 2.5 Hz a cycle is 20 control steps, at 3 Hz 16 2/3, between two steps."""
+    """A cycle lasts 20 control steps at 2.5 Hz; at 3 Hz it lasts 16 2/3, so tilts interpolate."""
     task = LowLevelTask(LowLevelConfig(), 2, seed=0, training=False)
     try:
         steps = np.arange(1.0, 1.0 + task.episodes.tilts.shape[1])
-        task.episodes.tilts[:, :, 0] = 0.01 * steps  # grows with age
+        task.episodes.tilts[:, :, 0] = 0.01 * steps  # 0.01 per step of age
         ago = task._last_tilt(np.array([2.5, 3.0]))
         np.testing.assert_allclose(ago, [[0.20, 0.0], [0.01 * 50 / 3, 0.0]], atol=1e-12)
     finally:
@@ -929,7 +946,7 @@ def test_tilts_are_remembered_step_by_step() -> None:
             task.step(np.full((1, 12), 0.3))
             seen.append(task.locomotion.world.state.gravity[0, :2].copy())
         np.testing.assert_array_equal(task.episodes.tilts[0, :4], seen[::-1])
-        assert not task.episodes.tilts[0, 4:].any()  # before the episode it stood upright
+        assert not task.episodes.tilts[0, 4:].any()  # upright before the episode
         assert np.ptp(seen, axis=0).max() > 1e-4
     finally:
         task.close()

@@ -1,4 +1,4 @@
-"""MuJoCo's robot is Bullet's on the same ground; an exported pair is evaluated there and logged."""
+"""MuJoCo's robot and ground match Bullet's; an exported pair is evaluated and logged there."""
 
 import csv
 import dataclasses
@@ -38,7 +38,7 @@ WEIGHT = 12.6 * 9.81
 def make_world(
     family: str = "", level: int = 0, robot: RobotConfig = ROBOT, **settings: float
 ) -> MujocoWorld:
-    """A robot on a tile; on level ground without a family."""
+    """A robot on a tile of ``family``, or on level ground if that is empty."""
     field, config = TileField((1, 1)), MujocoConfig(**settings)  # type: ignore[arg-type]
     if family:
         field.place(0, 0, tile_of(0, family, level, 0))
@@ -46,7 +46,7 @@ def make_world(
 
 
 def place(world: MujocoWorld, height: float = 0.0, yaw: float = 0.0) -> None:
-    """In the nominal pose, ``height`` m above the ground at (1, 4) m."""
+    """Place the robot at (1, 4) m in the nominal pose, its feet ``height`` m above level ground."""
     stand = nominal_height(world.robot, world.state.geometry)
     position, turn = np.array([[1.0, 4.0, height + stand]]), yaw_quaternion(np.array([yaw]))
     world.reset_robots([0], position, turn, nominal_pose(world.robot)[None])
@@ -114,7 +114,7 @@ def test_it_stands_on_its_feet() -> None:
     assert state.foot_force.sum() == pytest.approx(WEIGHT, rel=0.01)
     assert (state.foot_force > 15.0).all() and not state.leg_force.any()
     assert state.yaw[0] == pytest.approx(0.7, abs=0.01)
-    assert np.abs(state.q - nominal_pose(ROBOT)).max() < 0.3  # PD control without an integral
+    assert np.abs(state.q - nominal_pose(ROBOT)).max() < 0.3  # PD control has no integral term
     assert np.abs(state.torque).max() == pytest.approx(
         20.0 * np.abs(state.q - nominal_pose(ROBOT)).max(), rel=0.05
     )
@@ -125,7 +125,7 @@ def test_it_stands_on_its_feet() -> None:
 
 
 def sunk(solref: float) -> float:
-    """m that the deepest foot of a robot that landed from 0.3 m got under the ground."""
+    """Greatest depth in m of a foot below the ground after a drop from 0.3 m."""
     world, deepest = make_world(solref=solref), 0.0
     place(world, height=0.3)
     for _ in range(30):
@@ -141,7 +141,7 @@ def test_hard_contacts_let_feet_sink_less() -> None:
 
 def test_it_lies_on_its_back() -> None:
     world = make_world()
-    over = np.array([[1.0, 0.0, 0.0, 0.0]])  # half a turn about the axis ahead
+    over = np.array([[1.0, 0.0, 0.0, 0.0]])  # half a turn about the forward axis
     world.reset_robots([0], np.array([[1.0, 4.0, 0.06]]), over, nominal_pose(ROBOT)[None])
     hold(world, 1.0)
     state = world.state
@@ -209,7 +209,7 @@ def test_a_urdf_that_mujoco_cannot_load_is_one_line(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shipped pair."""
+    """Export of the shipped pair."""
     path = tmp_path_factory.mktemp("export")
     export.write(export.load_pair(PRETRAINED / "low", PRETRAINED / "high"), path, ["onnx"])
     return path
@@ -221,7 +221,7 @@ def controller(folder: Path) -> Controller:
 
 
 def run(controller: Controller, family: str, **settings: float) -> tuple[trace.Trace, LogWriter]:
-    """An episode of level 6: its trace with the simulator's truth, and its log."""
+    """Run an episode on level 6; return the simulator's own trace of it and its log."""
     pair = runner.Deployed(controller, LogWriter(controller))
     assert pair.log is not None
     watcher, cell = Tracer(pair, 0), Cell("tdgc", "nominal", family, 6, 0, 1)
@@ -233,7 +233,7 @@ def run(controller: Controller, family: str, **settings: float) -> tuple[trace.T
 def slipped(
     controller: Controller, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[trace.Trace, Path]:
-    """A robot on ice: it gets nowhere."""
+    """Trace and log of a robot on ice, which does not reach the goal."""
     truth, writer = run(controller, "rough", friction=0.03)
     assert truth.outcome != "reached"
     path = tmp_path_factory.mktemp("logs") / "ice.npz"
@@ -264,14 +264,15 @@ def test_a_log_has_what_the_simulator_knows_but_its_truth(
         "error_roll",
     ]
     exact += [f"probe_{k:02d}" for k in range(32)] + ["seconds"]
-    if seen["seconds"][-1] < 1.5 * controller.dt:  # no second step says how far the clock went
+    if seen["seconds"][-1] < 1.5 * controller.dt:  # no second step shows the clock's advance
         assert np.isnan(seen["command_frequency"][-2])
         seen["command_frequency"][-2] = truth["command_frequency"][-2]
     for name in exact:
         assert seen[name][:-1] == pytest.approx(truth[name][:-1], abs=1e-4, nan_ok=True), name
     for name in ("gait", "family"):
         assert list(seen[name][:-1]) == list(truth[name][:-1])
-    # Means over all of it; within a decision a trunk sways, and the simulator samples that.
+    # These agree on average over the episode: within a decision the trunk sways, which the
+    # simulator samples.
     for name, rounding in (("vx", 0.01), ("vy", 0.01), ("yaw_rate", 0.01)):
         off = seen[f"error_{name}"][1:-1] - truth[f"error_{name}"][1:-1]
         assert abs(np.mean(off)) < rounding and np.std(off) < 0.1, name
@@ -295,7 +296,7 @@ def test_the_graphs_give_what_the_log_says(
 
 
 def edited(path: Path, out: Path, **values: np.ndarray | None) -> Path:
-    """A copy of a log with other values, or without."""
+    """Copy a log with some values replaced, or removed where None."""
     table = dict(np.load(path)) | values
     np.savez(out, **{name: value for name, value in table.items() if value is not None})
     return out
@@ -310,7 +311,10 @@ def holed(array: np.ndarray, row: int) -> np.ndarray:
 def test_nobody_knows_how_far_the_clock_went_in_a_last_step(
     controller: Controller, slipped: tuple[trace.Trace, Path], tmp_path: Path
 ) -> None:
-    """A log that ends a step after a decision, its last row without what would have followed."""
+    """The frequency carried out is NaN where a log ends one step after a decision.
+
+    The last row lacks the values of ``log.GIVEN``, since no step followed.
+    """
     short = {name: array[:62] for name, array in np.load(slipped[1]).items()}
     short |= {name: holed(short[name], 61) for name in log.GIVEN}
     path = edited(slipped[1], tmp_path / "short.npz", **short)
@@ -439,7 +443,7 @@ def test_the_benchmark_writes_what_evaluate_writes(folder: Path, tmp_path: Path)
     assert (settings["armature"], settings["friction"], settings["solref"]) == (0.005, 0.7, 0.005)
     logs = sorted(path.name for path in (tmp_path / "logs").iterdir())
     assert logs == [f"tdgc-mujoco_nominal_{family}_09_000.npz" for family in ("gap", "rough")]
-    # An episode follows from its tile and the settings, whatever ran before it.
+    # An episode depends on its tile and the settings alone, not on what ran before.
     one = Cell(runner.POLICY, "nominal", "gap", 9, 1, 1)
     config = MujocoConfig(armature=0.005, friction=0.7)
     episodes, _ = runner.run_cell(one, folder, config, 0, 0, tmp_path, 0)
@@ -580,7 +584,7 @@ def test_documents_name_what_there_is(
 ) -> None:
     settings = [field.name for field in dataclasses.fields(MujocoConfig)]
     assert first_cells("mujoco.md", "Physics") == settings
-    logged = {"time", *log.layout(controller), "probe_age"}  # which the first policies do not take
+    logged = {"time", *log.layout(controller), "probe_age"}  # which not every policy takes
     assert set(first_cells("deploy.md", "Logs")) == logged
     with pytest.raises(SystemExit):
         runner.main(["--help"])

@@ -1,4 +1,4 @@
-"""Tables of terms: rows, columns and mirrors follow from them."""
+"""Observation layouts: rows, columns, noise and mirror images follow from the terms."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Figures come out of files, also at the ends of the scale; headings are told from the travel."""
+"""Figures are drawn from result files, also for rates of 0 and 1; headings relative to travel."""
 
 from __future__ import annotations
 
@@ -20,13 +20,16 @@ FAMILIES = ("rough", "gap")
 
 
 def straight(start: Array, way: Array, heading: float, seconds: float) -> Array:
-    """(n, 3) poses every 0.2 s at constant velocity ``way`` (2,) m/s, the nose at ``heading``."""
+    """Poses (n, 3) every 0.2 s at constant velocity ``way`` (2,) m/s and ``heading`` rad."""
     times = np.append(np.arange(0.0, seconds, 0.2), seconds)
     return np.column_stack([start[:2] + times[:, None] * way, np.full(len(times), heading)])
 
 
 def write(folder: Path, conditions: Sequence[str] = ("nominal",), heading: float = 0.0) -> Path:
-    """Results of ten robots a cell: ``tdgc``'s all arrive, ``gp``'s all fall; a gait a family."""
+    """Write results of ten robots per cell: all of ``tdgc`` arrive, all of ``gp`` fall.
+
+    ``tdgc`` uses one gait per family, ``gp`` trots.
+    """
     episodes = []
     for condition in conditions:
         for policy, outcome in (("tdgc", "reached"), ("gp", "fell")):
@@ -47,21 +50,21 @@ def write(folder: Path, conditions: Sequence[str] = ("nominal",), heading: float
 
 
 def picture(path: Path) -> Array:
-    """(height, width, 3), and not blank."""
+    """Pixels of a figure, (height, width, 3), which must not be blank."""
     pixels = matplotlib.image.imread(path)[..., :3]
     assert pixels.shape[0] > 200 and np.ptp(pixels) == 1.0
     return pixels
 
 
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures that are drawn from now on, which are not written."""
+    """The figures drawn from now on, which are collected instead of written."""
     figures: list[Figure] = []
     monkeypatch.setattr(plots, "_save", lambda figure, out: figures.append(figure))
     return figures
 
 
 def share_of(pixels: Array, colour: str) -> float:
-    """Of all pixels, those of nearly that colour."""
+    """Share of all pixels that have nearly this colour."""
     wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
     return float((np.abs(pixels - wanted) < 0.02).all(axis=-1).mean())
 
@@ -74,15 +77,15 @@ def test_success_figure_with_rates_of_none_and_all(tmp_path: Path) -> None:
     write(tmp_path, ["nominal", "mixed", "pushes"])
     plots.success_by_level(tmp_path / "summary.json", tmp_path / "three.png")
     three = picture(tmp_path / "three.png")
-    assert three.shape[0] > 2.5 * one.shape[0] - 200  # a row of panels a condition
+    assert three.shape[0] > 2.5 * one.shape[0] - 200  # one row of panels per condition
 
 
 def test_gait_figure_is_half_and_half(tmp_path: Path) -> None:
-    """tdgc: one family all trot, the other all pronk; gp: all trot."""
+    """``tdgc`` only trots in one family and only pronks in the other; ``gp`` only trots."""
     plots.gait_shares(write(tmp_path), tmp_path / "gaits.png")
     pixels = picture(tmp_path / "gaits.png")
     trot, pronk, pace, bound = (share_of(pixels, c) for c in plots.GAIT_COLOURS)
-    # Three bars against one; the legend, which alone has the others, has as much of each.
+    # Trot has three bars, pronk one; the legend, the only place of the others, shows all equally.
     assert (trot - pace) / (pronk - pace) == pytest.approx(3.0, abs=0.1)
     assert 0.0 < bound < 0.1 * pronk
 
@@ -95,7 +98,7 @@ def test_heading_to_travel() -> None:
     backwards = plots.heading_to_travel(straight(np.zeros(2), north, -np.pi / 2, 1.0))
     assert np.abs(backwards) == pytest.approx(np.full(4, np.pi))
     assert plots.heading_to_travel(straight(np.zeros(2), 0.19 * north, 0.0, 2.0)).size == 0
-    # Turning left along a circle with the nose ahead, across the cut at pi.
+    # Turning left along a circle, facing ahead, across the wrap at pi.
     angle = np.linspace(0.0, 2.0, 21)
     circle = np.column_stack([np.cos(angle), np.sin(angle), angle + np.pi / 2])
     circle[:, 2] = np.mod(circle[:, 2] + np.pi, 2 * np.pi) - np.pi
@@ -103,7 +106,7 @@ def test_heading_to_travel() -> None:
 
 
 def test_heading_figure_turns_with_the_robots(tmp_path: Path) -> None:
-    """Robots that walk ahead fill what lies above the centres, backwards what lies below."""
+    """Robots that walk forwards fill the area above the centres, backwards that below."""
     centroids = []
     for name, heading in (("ahead", 0.0), ("back", np.pi)):
         (tmp_path / name).mkdir()
@@ -116,7 +119,7 @@ def test_heading_figure_turns_with_the_robots(tmp_path: Path) -> None:
 
 
 def test_figures_of_a_single_episode_hold_their_captions(tmp_path: Path) -> None:
-    """Nothing touches the sides, where a line too long would be cut off."""
+    """Nothing touches the left and right edges, where too long a line would be cut off."""
     tile = tile_of(0, "gap", 6, 0)
     track = straight(tile.start, np.array([0.5, 0.0]), 0.0, 9.5)
     where = ("gp", "nominal", "gap", 6, 0, 0)
@@ -141,7 +144,7 @@ def test_heading_figure_of_robots_that_stand(tmp_path: Path) -> None:
 def test_trajectory_figure_has_a_row_a_family_on_its_hardest_level(tmp_path: Path) -> None:
     plots.trajectories(write(tmp_path), tmp_path / "trajectories.png")
     pixels = picture(tmp_path / "trajectories.png")
-    assert pixels.shape[1] > 2 * pixels.shape[0]  # two rows of three tiles each for two policies
+    assert pixels.shape[1] > 2 * pixels.shape[0]  # two rows, each with three tiles per policy
     width = pixels.shape[1]
     left, right = pixels[:, : int(0.45 * width)], pixels[:, int(0.52 * width) :]
     blue, orange = plots.POLICY_COLOURS["tdgc"], plots.POLICY_COLOURS["gp"]
@@ -153,7 +156,7 @@ def test_trajectory_figure_has_a_row_a_family_on_its_hardest_level(tmp_path: Pat
 def test_figures_of_another_condition_say_so(
     draw: Callable[[Path, Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They show the first condition alone."""
+    """They show only the first condition, and name it unless it is nominal."""
     figures = drawn(monkeypatch)
     for conditions in (["nominal", "pushes"], ["pushes", "nominal"]):
         draw(write(tmp_path, conditions), tmp_path / "figure.png")
@@ -170,7 +173,7 @@ def test_training_figure_skips_what_a_phase_does_not_log(tmp_path: Path) -> None
 
 
 def test_decision_figure_marks_the_end_of_imitation(tmp_path: Path) -> None:
-    """In a colour that nothing else has: a dotted grey line in each of the four panels."""
+    """The mark is a dotted line in each of the four panels, in a grey that nothing else has."""
     taught = {"steps": 100_000, "reward/total": 0.1, "level/gap": 1.0, "success/gap": 0.2}
     own = {"steps": 300_000, "reward/total": 0.2, "level/gap": 2.0, "success/gap": 0.4}
 
@@ -184,7 +187,7 @@ def test_decision_figure_marks_the_end_of_imitation(tmp_path: Path) -> None:
 
 
 def test_ablation_figure_has_a_bar_per_variant_as_long_as_its_rate(tmp_path: Path) -> None:
-    """Half of the goals, all of them, and one that is still to come."""
+    """One variant reaches half of the goals, one all of them, and one is still to come."""
     rows: list[dict[str, object]] = [
         {"name": "full", "what": "all", "n": 50, "rate": 0.5, "ci_low": 0.37, "ci_high": 0.63,
          "seeds": {"1": 0.4, "2": 0.6}},
@@ -197,7 +200,7 @@ def test_ablation_figure_has_a_bar_per_variant_as_long_as_its_rate(tmp_path: Pat
         (tmp_path / "ablation.json").write_text(json.dumps({"rows": some}))
         plots.ablation(tmp_path / "ablation.json", tmp_path / "ablation.png")
         pixels = matplotlib.image.imread(tmp_path / "ablation.png")[..., :3]
-        bar = np.abs(pixels - np.array([0.4, 0.668, 0.82])) < 0.02  # tdgc's blue, 0.6 of it
+        bar = np.abs(pixels - np.array([0.4, 0.668, 0.82])) < 0.02  # tdgc's blue with alpha 0.6
         widest = bar.all(axis=-1).sum(axis=1)
         shares.append(widest.max() / pixels.shape[1])
         assert len(pixels) == 120 * (1.0 + 0.3 * len([row for row in some if "n" in row]))
@@ -210,7 +213,7 @@ def test_ablation_figure_has_a_bar_per_variant_as_long_as_its_rate(tmp_path: Pat
 def test_ablation_figure_has_its_line_at_full(
     names: list[str], lines: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever that is in the table, which may be without it."""
+    """The line is drawn wherever ``full`` is in the table; without it there is none."""
     figures, cell = drawn(monkeypatch), {"what": "it", "n": 50, "seeds": {"1": 0.5}}
     rates = [{"rate": r, "ci_low": r - 0.1, "ci_high": r + 0.1} for r in (0.5, 0.8)]
     rows = [{"name": name} | cell | some for name, some in zip(names, rates, strict=False)]

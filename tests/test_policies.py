@@ -61,7 +61,7 @@ def saved(tmp_path: Path) -> Path:
 
 
 class TinyEnv(gym.Env):
-    """Reward for an action near a part of the observation; ends after 5 steps."""
+    """Rewards actions near a part of the observation; episodes end after 5 steps."""
 
     def __init__(self) -> None:
         self.observation_space, self.action_space = spaces_pair()
@@ -109,7 +109,7 @@ def test_default_architecture():
     ]
     assert sum(isinstance(m, nn.ELU) for m in body.modules()) == 4
     assert policy.log_std.tolist() == [-0.5] * ACT
-    # SB3's own start: orthogonal, gain 0.01 for the action and sqrt(2) for hidden layers
+    # SB3's initialisation: orthogonal, gain 0.01 for the action and sqrt(2) for hidden layers
     gram = policy.action_net.weight @ policy.action_net.weight.T
     assert th.allclose(gram, 1e-4 * th.eye(ACT), atol=1e-8)
     gram = body.policy_net[0].weight.T @ body.policy_net[0].weight
@@ -349,7 +349,7 @@ def test_what_cannot_be_read_back_is_not_written(tmp_path):
 
 
 def test_files_are_replaced_not_written_over(saved):
-    """Whoever has the old files open goes on reading the old policy."""
+    """Hard links to the old files, like open files, still give the old policy."""
     old = saved.parent / "old"
     for suffix in (".json", ".safetensors"):
         os.link(f"{saved}{suffix}", f"{old}{suffix}")
@@ -361,7 +361,7 @@ def test_files_are_replaced_not_written_over(saved):
 def test_failed_write_leaves_the_old_policy_and_no_scraps(saved):
     before = policies.load(saved)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # as good as a full disk
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # like a full disk
     try:
         with pytest.raises(OSError, match=r"File too large"):
             policies.save(saved, mlp_policy(), {"seed": 1})
@@ -384,7 +384,7 @@ def refused(path: Path, message: str) -> None:
 
 
 def rewrite(path: Path, *keys: str, value: object) -> None:
-    """Set one value of the JSON file, by the keys that lead to it."""
+    """Set one value of the JSON file, given the keys that lead to it."""
     file = Path(f"{path}.json")
     table = json.loads(file.read_text())
     inner = table
@@ -395,7 +395,7 @@ def rewrite(path: Path, *keys: str, value: object) -> None:
 
 
 def reweigh(path: Path, data: bytes) -> None:
-    """Replace the weights, with the checksum that goes with them."""
+    """Replace the weights, and the checksum to match."""
     Path(f"{path}.safetensors").write_bytes(data)
     rewrite(path, "sha256", value=hashlib.sha256(data).hexdigest())
 
@@ -541,31 +541,32 @@ def test_a_pickle_is_never_opened(saved):
     assert mark.exists()  # the bomb was live
 
 
-def test_no_byte_can_be_changed_unseen(saved):
-    """Flip bytes all over both files: the load fails with its own error or changes only meta."""
+def test_flipped_bits_are_refused_in_one_line(saved):
+    """Every flipped bit in the weights is refused; one in the JSON is, or leaves it well-formed."""
     rng = np.random.default_rng(0)
     obs = np.linspace(-1, 1, OBS)
     want = policies.load(saved).predict(obs)[0]
+    refusals = {}
     for suffix, trials in ((".json", 300), (".safetensors", 50)):
         file = Path(f"{saved}{suffix}")
         good = file.read_bytes()
-        survivors = 0
+        refusals[suffix] = 0
         for _ in range(trials):
             data = bytearray(good)
             data[rng.integers(len(data))] ^= 1 << rng.integers(8)
             file.write_bytes(data)
             try:
-                survivors += np.array_equal(policies.load(saved).predict(obs)[0], want)
+                policies.load(saved).predict(obs)
             except PolicyFileError as error:
                 assert "\n" not in str(error)
+                refusals[suffix] += 1
         file.write_bytes(good)
-        if suffix == ".safetensors":
-            assert survivors == 0
+    assert refusals[".safetensors"] == 50 and refusals[".json"] > 150
     assert np.array_equal(policies.load(saved).predict(obs)[0], want)
 
 
 def test_acting_needs_no_sb3(tmp_path: Path) -> None:
-    """A loaded policy acts, and a robot is driven by it, where SB3 is not even imported."""
+    """Loading a policy, acting with it and importing the evaluation do not import SB3."""
     actor_critic = mlp_policy()
     policies.save(tmp_path / "policy", actor_critic, {})
     code = (

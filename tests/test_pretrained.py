@@ -1,4 +1,4 @@
-"""The shipped pair is what today's commands give."""
+"""The shipped pair: trained with the current defaults, each by one complete run."""
 
 import dataclasses
 import hashlib
@@ -45,7 +45,7 @@ def test_the_low_policy_was_trained_with_the_defaults() -> None:
 
 
 def test_the_high_policy_was_trained_with_the_defaults() -> None:
-    """On the shipped low policy."""
+    """It was also trained on the shipped low policy."""
     used = PRETRAINED / "low"
     _, low = load_low(used)
     defaults = HighTrainConfig()

@@ -1,4 +1,4 @@
-"""Height probes: what they see, and what their sensor gets wrong."""
+"""Height probes: their layout, what they read, and the errors of their sensor."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROBOTS = 8
 
 @pytest.fixture
 def loco() -> Iterator[Locomotion]:
-    """Robots over the first trench of their tiles."""
+    """Robots 0.6 m before the first trench of their tiles."""
     field = TileField((ROBOTS, 1))
     for k in range(ROBOTS):
         field.place(k, 0, make_tile("gap", 1.0, np.random.default_rng(k)))
@@ -75,7 +75,7 @@ def test_noise_is_as_wide_as_it_says(loco: Locomotion) -> None:
     assert 0.0195 < np.abs(off).max() <= 0.02
     assert abs(np.mean(off)) < 0.001
     assert np.abs(probes.read()).max() <= PROBE_RANGE
-    assert np.array_equal(probes.read(), probes.read())  # one reading a decision
+    assert np.array_equal(probes.read(), probes.read())  # reading draws no new noise
 
 
 def test_the_late_are_one_decision_late(loco: Locomotion) -> None:
@@ -84,15 +84,15 @@ def test_the_late_are_one_decision_late(loco: Locomotion) -> None:
     late = probes.late.copy()
     assert 0 < late.sum() < ROBOTS
     seen = [height_probes(loco, POINTS)]
-    assert np.array_equal(probes.read(), seen[0])  # nothing was seen before
+    assert np.array_equal(probes.read(), seen[0])  # nothing was measured before
     for _ in range(3):
         loco.world.state.position[:, 0] += 0.07
         probes.measure()
         seen.append(height_probes(loco, POINTS))
         assert np.array_equal(probes.read()[late], seen[-2][late])
         assert np.array_equal(probes.read()[~late], seen[-1][~late])
-        assert (np.abs(seen[-1] - seen[-2]).max(axis=1) > 0.1).all()  # a probe came to a lip
-    probes.begin(np.flatnonzero(late)[:1])  # a new episode does not look back
+        assert (np.abs(seen[-1] - seen[-2]).max(axis=1) > 0.1).all()  # a probe crossed a lip
+    probes.begin(np.flatnonzero(late)[:1])  # a new episode forgets the last one's readings
     first = np.flatnonzero(late)[0]
     assert np.array_equal(probes.read()[first], seen[-1][first])
 

@@ -1,4 +1,4 @@
-"""Random pushes: when they come, how fast, and whom they find."""
+"""Random pushes: when they come and how fast they are."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ CONFIG = RandomisationConfig(push_speed=0.6, push_interval=(0.45, 0.45))
 
 
 class Pushed:
-    """A world of trunks that add up what they are pushed by, (M, 3) m/s."""
+    """A stub of the world that adds up the velocities of each trunk's pushes, (M, 3) m/s."""
 
     def __init__(self, num_robots: int) -> None:
         self.velocity = np.zeros((num_robots, 3))
@@ -24,7 +24,10 @@ class Pushed:
 
 @pytest.mark.parametrize(("kind", "first"), [(np.int64, 4), (np.float64, 5)])
 def test_pushes_come_after_their_interval(kind: Any, first: int) -> None:
-    """0.45 s of steps of 0.1 s: rounded down where whole steps are kept, else the next step."""
+    """An interval of 4.5 steps ends at step 4 if due steps are integers, at step 5 if floats.
+
+    It is 0.45 s at 0.1 s per step.
+    """
     pushes = Pushes(CONFIG, np.random.default_rng(0), 0.1, np.zeros(3, dtype=kind))
     elapsed, world, robots = np.array([0, 0, 10]), Pushed(3), np.arange(3)
     pushes.schedule(robots, elapsed)
@@ -47,4 +50,4 @@ def test_speeds_are_horizontal_and_scaled_by_the_width() -> None:
     assert (world.velocity[:, 2] == 0.0).all() and (speed[0] == 0.0).all()
     assert 0.28 < speed[1].max() <= 0.3 and 0.57 < speed[2].max() <= 0.6
     angle = np.arctan2(world.velocity[300:, 1], world.velocity[300:, 0])
-    assert (np.histogram(angle, 8, (-np.pi, np.pi))[0] > 40).all()  # 75 each, 4 deviations
+    assert (np.histogram(angle, 8, (-np.pi, np.pi))[0] > 40).all()  # 75 less 4 deviations

@@ -1,4 +1,4 @@
-"""The documents are true: their commands and code run, their tables are what the code has."""
+"""The documents are true: their commands and code run, and their tables match the code."""
 
 import argparse
 import configparser
@@ -56,7 +56,7 @@ MAINS = {
 
 @dataclass(frozen=True)
 class Run:
-    """What is added to a command to make it short, and files that it leaves, in the workspace."""
+    """Flags added to a command to make it short, and the files it leaves in the workspace."""
 
     added: str
     leaves: tuple[str, ...]
@@ -68,8 +68,8 @@ HIGH = (
     "--set ppo.n_steps=2 --set ppo.minibatches=1 --set imitation.minibatches=1"
 )
 ONE = "--episodes 1 --workers 1"
-FALL = f"--policies gp --families gap --levels 10 {ONE}"  # in the first trench, within seconds
-#: Commands that run: chains of which each needs what those before it leave.
+FALL = f"--policies gp --families gap --levels 10 {ONE}"  # into the first trench, within seconds
+#: Commands that are run, in chains: each needs what those before it in its chain leave.
 CHAINS: tuple[dict[str, Run], ...] = (
     {
         "python train_low.py": Run(
@@ -165,7 +165,7 @@ CHAINS: tuple[dict[str, Run], ...] = (
     },
 )
 RUNS = {command: run for chain in CHAINS for command, run in chain.items()}
-#: Commands that take long, or need a display or a cluster: their flags are read.
+#: Commands that take long, or need a display or a cluster: only their flags are parsed.
 READ = (
     "python evaluate.py --tracking",
     "python evaluate.py --gui",
@@ -185,12 +185,12 @@ READ = (
     "python train_high.py --low runs/low/policy --cluster auto --workers auto",
     "python evaluate.py --cluster auto",
 )
-#: Ray's own.
+#: Ray's own commands: only their flags are parsed.
 RAY = (
     "RAY_worker_niceness=0 ray start --head --port=6379",
     "RAY_worker_niceness=0 ray start --address=HOST:6379",
 )
-#: Set-up and checks, which .ci/run runs as they stand or with all extras and all tests.
+#: Set-up and checks, which .ci/run runs as written, or with all extras and all tests.
 BY_CI = (
     "python3 -m venv .venv",
     ".venv/bin/pip install -c constraints.txt -e '.[video,trace,export]'",
@@ -216,7 +216,7 @@ def blocks(text: str, language: str) -> list[str]:
 
 
 def commands() -> Iterator[str]:
-    """The shell commands of all documents, without comments, chains taken apart."""
+    """The shell commands of all documents, without comments and split at ``&&``."""
     for text in TEXT.values():
         lines = "".join(blocks(text, "bash")).replace("\\\n", " ").splitlines()
         bare = [re.sub(r"(^|\s)#.*", "", line) for line in lines]
@@ -224,7 +224,7 @@ def commands() -> Iterator[str]:
 
 
 def tables(name: str, heading: str | None = None) -> list[list[list[str]]]:
-    """Tables of a document, or of a section of it, as rows of cells without the head."""
+    """Tables of a document, or of one of its sections, as rows of cells without the header."""
     text = TEXT[name]
     if heading is not None:
         text = re.split("^## ", text.split(f"\n## {heading}\n")[1], flags=re.MULTILINE)[0]
@@ -250,7 +250,7 @@ def test_every_command_is_run_or_read() -> None:
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which commands run as in the repository, and write."""
+    """A folder in which commands run as in the repository and write their files."""
     folder = tmp_path_factory.mktemp("workspace")
     for name in ("train_low.py", "train_high.py", "evaluate.py", "tdgc", "urdf"):
         (folder / name).symlink_to(ROOT / name)
@@ -288,7 +288,7 @@ def test_commands_run(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("command", READ)
 def test_flags_are_read(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class ReadError(Exception):
-        """All flags were read."""
+        """All flags were parsed."""
 
     parse = argparse.ArgumentParser.parse_args
 
@@ -382,7 +382,7 @@ def test_families_are_the_terrains() -> None:
     table = tables("benchmark.md")[0]
     assert tuple(column(table)) == ALL_FAMILIES
     for family, _, first, last in table:
-        if family not in ("mixed", "ditches"):  # which are made of others
+        if family not in ("mixed", "ditches"):  # which combine others
             assert (float(first.split()[0]), float(last.split()[0])) == PARAMETER_RANGES[family]
 
 
@@ -438,7 +438,7 @@ def test_rooms_are_in_order() -> None:
 
 
 def anchors(text: str) -> set[str]:
-    """What GitHub lets links to a page's headings end in."""
+    """The anchors that GitHub gives to a page's headings."""
     headings = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings}
 

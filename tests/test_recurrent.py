@@ -27,7 +27,7 @@ ENVS, STEPS = 5, 12
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """The networks are so small that threads only wait for each other."""
+    """Use one thread, because with networks this small threads only wait for each other."""
     threads = th.get_num_threads()
     th.set_num_threads(1)
     yield
@@ -35,7 +35,7 @@ def one_thread():
 
 
 class MemoryEnv(gym.Env):
-    """Reward for repeating the last observation; an episode ends at random, some at a limit."""
+    """Rewards repeating the previous observation; episodes end or are truncated at random."""
 
     def __init__(self, seed: int) -> None:
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBS,))
@@ -57,7 +57,7 @@ class MemoryEnv(gym.Env):
 
 
 def make_model(policy, batch_size: int = 24, **kwargs) -> FastRecurrentPPO:
-    """Two minibatches, of three environments and of two, unless told."""
+    """Make a learner, by default with two minibatches, of three environments and of two."""
     env = DummyVecEnv([lambda i=i: MemoryEnv(i) for i in range(ENVS)])
     policy_kwargs = {"lstm_hidden_size": HIDDEN, "net_arch": [8]} | kwargs.pop("policy_kwargs", {})
     defaults = {"n_epochs": 3, "learning_rate": 3e-3, "seed": 3, "device": "cpu"}
@@ -91,13 +91,13 @@ def test_parameters_are_the_stock_policys():
 
 
 def test_outputs_and_gradients_on_rollouts():
-    """Every minibatch of a real rollout, episodes starting anywhere, against the stock pass."""
+    """They equal the stock policy's on all minibatches of a rollout with starts anywhere in it."""
     model, stock = make_model(FastRecurrentPolicy), make_model("MlpLstmPolicy").policy
     model.learn(3 * ENVS * STEPS)
     stock.load_state_dict(model.policy.state_dict())
     starts = th.zeros(STEPS)
     for batch in model.rollout_buffer.get(24):
-        assert batch.lstm_states.pi[0].abs().max() > 0.01  # the rollout goes on from another
+        assert batch.lstm_states.pi[0].abs().max() > 0.01  # the rollout continues an earlier one
         results = []
         for policy in (model.policy, stock):
             policy.zero_grad()
@@ -113,7 +113,7 @@ def test_outputs_and_gradients_on_rollouts():
 
 
 def test_an_episode_starts_from_nothing():
-    """By hand, without the stock pass: from its start on, an episode is a sequence of its own."""
+    """Without the stock policy: within a rollout, an episode is evaluated as if on its own."""
     policy = make_model(FastRecurrentPolicy).policy
     generator = th.Generator().manual_seed(1)
     obs = th.randn(3, 5, OBS, generator=generator)
@@ -136,13 +136,13 @@ def test_an_episode_starts_from_nothing():
     for row, first in ((0, 0), (1, 3)):
         alone = evaluate(slice(row, row + 1), slice(first, 5), zeros, th.zeros(3, 5))
         assert (whole[:, row, first:] - alone[:, 0]).abs().max() < 1e-6
-    # Without a start the states matter to the end.
+    # Without an episode start, the initial states matter to the end.
     without = evaluate(slice(2, 3), slice(5), zeros, starts)
     assert (whole[:, 2] - without[:, 0]).abs().amax(0).min() > 1e-3
 
 
 def memories(robots: int) -> RNNStates:
-    """Each state of robot i is i, i + 0.25, i + 0.5 or i + 0.75 throughout."""
+    """Hidden states filled with i, i + 0.25, i + 0.5 and i + 0.75 for robot i."""
     whose = th.arange(robots).view(1, -1, 1).expand(1, robots, HIDDEN)
     h_pi, c_pi, h_vf, c_vf = (whose + part for part in (0.0, 0.25, 0.5, 0.75))
     return RNNStates((h_pi, c_pi), (h_vf, c_vf))
@@ -150,8 +150,11 @@ def memories(robots: int) -> RNNStates:
 
 @pytest.mark.parametrize("untold", [None, 2])
 def test_memories_are_exchanged_among_robots_that_are_told_nothing(untold):
-    """Whole ones, none is lost, and the expected number: half of those taking part, less those
-    who get their own back, of which there is one in every shuffle on average."""
+    """Hidden states move as a whole, none is lost, and the expected number of them moves.
+
+    That is half of those taking part, less the robots that get their own back: one per shuffle on
+    average.
+    """
     robots, rounds = 40, 200
     seen = np.zeros((robots, OBS), dtype=np.float32)
     seen[24:, 2] = 1.0
@@ -172,7 +175,7 @@ def test_memories_are_exchanged_among_robots_that_are_told_nothing(untold):
 
 
 def test_an_exchange_comes_after_a_rollout_and_changes_none():
-    """The next rollout begins from what was exchanged, and this one is learned as collected."""
+    """The next rollout starts from exchanged states, and this one is learned as collected."""
     model = make_model(FastRecurrentPolicy, learning_rate=0.0, exchange=MemoryExchange(1.0))
     collected = []
 
@@ -229,7 +232,7 @@ def test_order_of_environments_is_drawn_from_numpys_generator():
 def test_training_ends_at_the_same_weights():
     trained = []
     for policy in (FastRecurrentPolicy, "MlpLstmPolicy"):
-        model = make_model(policy)  # which seeds torch and numpy, so not before the loop
+        model = make_model(policy)  # inside the loop, as it seeds torch and numpy
         start = {name: t.clone() for name, t in model.policy.state_dict().items()}
         trained.append(dict(model.learn(3 * ENVS * STEPS).policy.state_dict()))
     fast, stock = trained
@@ -265,12 +268,13 @@ def test_a_minibatch_below_one_rollout_is_refused():
 
 # ------------------------------------------------------------------ left and right
 
-#: Two pairs of sides, a component along the middle and one across it; one action of each kind.
+#: Observation: two left-right pairs, the second negated when swapped, an entry that a mirror keeps
+#: and one that it negates; one action of each of the last two kinds.
 MIRROR = Mirror((1, 0, 3, 2, 4, 5), (1.0, 1.0, -1.0, -1.0, 1.0, -1.0), (0, 1), (1.0, -1.0))
 
 
 def run_through(policy, observations: np.ndarray, starts: np.ndarray) -> tuple[th.Tensor, ...]:
-    """Mean actions and values of (STEPS, ENVS, OBS), step by step with what is remembered."""
+    """Mean actions and values for (STEPS, ENVS, OBS), step by step, passing hidden states on."""
     size = policy.lstm_actor.hidden_size
     zeros = (th.zeros(1, ENVS, size), th.zeros(1, ENVS, size))
     states, actions, values = RNNStates(zeros, zeros), [], []
@@ -284,7 +288,7 @@ def run_through(policy, observations: np.ndarray, starts: np.ndarray) -> tuple[t
 
 
 def act_alike(loaded, seen: np.ndarray, starts: np.ndarray, wanted: th.Tensor):
-    """A policy from its file acts as ``run_through`` found; what it remembers in the end."""
+    """Check that a loaded policy acts as ``run_through`` found; return its last hidden state."""
     state = None
     for row, start, action in zip(seen, starts, wanted, strict=True):
         given, state = loaded.predict(row, state, start)
@@ -362,7 +366,7 @@ def test_a_feed_forward_policy_remembers_nothing_and_learns(mirror, tmp_path):
 
 
 def test_noise_of_the_gait_is_held_within_an_episode():
-    """Of a policy whose mean action is always 0, so that its actions are the noise."""
+    """The mean action is always 0 here, so that the actions are the noise."""
     gait = {"gait": GaitNoise(ENVS, 4, hold=5)}
     model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=gait)
     with th.no_grad():
@@ -376,7 +380,7 @@ def test_noise_of_the_gait_is_held_within_an_episode():
     changed = np.diff(buffer.actions[:, :, -1], axis=0) != 0.0
     starts = buffer.episode_starts[1:] > 0.0
     assert starts.any() and changed[starts].all()
-    for env in range(ENVS):  # runs of one value: no longer than five, and five where none starts
+    for env in range(ENVS):  # runs of one value: five long, less if an episode starts
         ends = np.flatnonzero(changed[:, env])
         runs = np.diff(ends)
         whole = ~starts[ends[1:], env]
@@ -431,7 +435,7 @@ def test_a_bonus_on_the_gaits_entropy_falls_to_nothing():
         policy.gait_bonus = 2.0
         *_, with_bonus = policy.evaluate_actions(*inputs)
     assert 0.0 < (with_bonus - without).min() and (with_bonus - without).max() < 2.0 * np.log(4.0)
-    # It holds gaits alive: minimised alone, it spreads a channel that was sure of the first gait.
+    # It keeps gaits in use: maximised alone, it spreads a channel that was sure of the first gait.
     mean, log_std = th.full((1,), -1.5, requires_grad=True), th.tensor(-1.0, requires_grad=True)
     optimiser = th.optim.Adam([mean, log_std], lr=0.05)
     for _ in range(100):
@@ -466,7 +470,7 @@ def test_an_encoder_learns_and_acts_from_its_file_as_it_was_trained(mirror, tmp_
     policies.save(tmp_path / "policy", model.policy, {})
     loaded = policies.load(tmp_path / "policy")
     assert (loaded.kind, loaded.header.lstm, loaded.header.encoder) == ("lstm", HIDDEN, (7, 5))
-    # The head is given 5 of the encoder after what the LSTM remembers.
+    # The head takes the LSTM's hidden state and then the encoder's 5 outputs.
     assert loaded.tensors["actor.0.weight"].shape[1] == HIDDEN + 5
     act_alike(loaded, seen, starts, wanted)
     other = make_model(FastRecurrentPolicy, policy_kwargs={**ENCODED, "mirror": mirror}).policy
@@ -478,7 +482,7 @@ def test_an_encoder_learns_and_acts_from_its_file_as_it_was_trained(mirror, tmp_
 
 
 def test_what_is_encoded_goes_past_the_memory():
-    """With a memory that forgets everything at once the policy still answers what it sees."""
+    """With an LSTM of zero weights, the policy still reacts to what it sees."""
     policy = make_model(FastRecurrentPolicy, policy_kwargs=ENCODED).policy
     with th.no_grad():
         for parameter in policy.lstm_actor.lstm.parameters():
@@ -495,7 +499,7 @@ def test_an_encoder_needs_a_memory():
 
 @pytest.mark.parametrize("kind", [{}, FORWARD, ENCODED], ids=["plain", "feed-forward", "encoded"])
 def test_a_rollout_is_evaluated_as_it_was_collected(kind):
-    """Before a parameter changes, the update sees the values and probabilities of collecting."""
+    """Until a parameter changes, the update gets the values and probabilities of the rollout."""
     model = make_model(FastRecurrentPolicy, learning_rate=0.0, policy_kwargs=kind)
     model.learn(2 * ENVS * STEPS)
     for batch in model.rollout_buffer.get(24):

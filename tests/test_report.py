@@ -1,4 +1,4 @@
-"""The report has the results' numbers, escaped, and needs nothing but itself and a browser."""
+"""The report shows the results' numbers, escapes all text, and needs nothing but a browser."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ REACHED = {"tdgc": 7, EVIL: 0}  # of 10 episodes
 
 
 def write_picture(path: Path) -> None:
-    """Noise, 64 x 48."""
+    """Write a picture of noise, 64 x 48."""
     pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(path)
 
 
 def write_mp4(path: Path) -> None:
-    """Five blank frames of 64 x 48."""
+    """Write a film of five blank frames, 64 x 48."""
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libx264", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
@@ -44,7 +44,7 @@ def write_mp4(path: Path) -> None:
 
 
 def write_table(folder: Path, reached_by: dict[str, int] = REACHED) -> None:
-    """Ten episodes a policy on the gaps of level 8, and one each with pushes."""
+    """Write ten nominal episodes per policy on Gap, level 8, and one with pushes."""
     tile = {"family": "gap", "level": 8, "seed": 3}
     walk = {"path_m": 5.25, "energy_j": 500.0, "shares": (1.0, 0.0, 0.0, 0.0)}
     way = {"goal": np.zeros(2), "track": np.zeros((2, 3))}
@@ -63,7 +63,7 @@ def write_table(folder: Path, reached_by: dict[str, int] = REACHED) -> None:
 
 
 def write_extras(folder: Path) -> None:
-    """A diagnosis of the other policy's failures, a tuning's effect, films of episode 0."""
+    """Write a diagnosis of ``EVIL``'s failures, a tuning's effect, films of episode 0, sheets."""
     failed = [
         Diagnosis(
             EVIL, "nominal", "gap", 8, k, 3, "fell", 9.5, "zone", "trench 2 of 4", layer,
@@ -155,10 +155,10 @@ def test_paired_differences_and_where_dominance_fails(tmp_path: Path) -> None:
     write_table(tmp_path, {"tdgc": 0, "gp": 10})
     reader = Reader(report.render(tmp_path))
     assert ["condition", "gap", "mean"] in reader.rows
-    # Of ten tiles all are lost: Wilson's 0 to 0.278 and 0.722 to 1, squared and added.
+    # All ten tiles are lost: Wilson's 0 to 0.278 and 0.722 to 1, added in quadrature.
     lost = "-100.0 below gp -100.0 to -60.8"
     assert ["nominal", lost, lost] in reader.rows
-    assert ["pushes", *["-100.0 -100.0 to +12.2"] * 2] in reader.rows  # one tile says little
+    assert ["pushes", *["-100.0 -100.0 to +12.2"] * 2] in reader.rows  # one tile proves nothing
 
 
 def test_diagnosis_tuning_and_conditions(page: Path) -> None:
@@ -248,7 +248,7 @@ def test_no_page_of_half_the_results(tmp_path: Path) -> None:
         report.write(tmp_path)
     assert not list(tmp_path.glob("report*"))
     write_table(tmp_path)
-    (tmp_path / report.NAME).mkdir()  # so that the page cannot take its place
+    (tmp_path / report.NAME).mkdir()  # so that the page cannot replace it
     with pytest.raises(OSError):
         report.write(tmp_path)
     assert [p.name for p in tmp_path.glob("report*")] == [report.NAME]
@@ -266,7 +266,7 @@ def test_an_unknown_condition_is_refused(tmp_path: Path) -> None:
 
 
 def browse(page: Path, *flags: str) -> tuple[str, list[str]]:
-    """Open a page in a browser without a window: what it prints, and its console's lines."""
+    """Open a page in a headless browser; return its output and the lines of its console."""
     names = ("chromium", "chromium-browser", "google-chrome")
     found = next(filter(None, map(shutil.which, names)), None)
     if found is None:
@@ -293,7 +293,7 @@ def test_a_browser_shows_it_without_complaint(page: Path) -> None:
     assert len(reader.named("img")) == 7 and len(reader.named("video")) == 1
 
 
-#: Says on the console what the browser made of the page.
+#: Script that reports on the console how the browser loaded the page.
 PROBE = """<script>
 addEventListener("load", () => {
   const video = document.querySelector("video"), root = document.documentElement;

@@ -40,7 +40,7 @@ def test_summary_counts_and_averages() -> None:
     assert table["mean"]["ci_low"] < 0.5 < table["mean"]["ci_high"]
 
 
-#: tdgc gains three of ten tiles of rough and loses one; of 40 of gap it loses 30.
+#: Of 10 tiles of rough, tdgc gains 3 and loses 1; of 40 tiles of gap, it loses 30.
 EPISODES = [
     *rows("tdgc", "rough", [True] * 6 + [False] * 1 + [False] * 3),
     *rows("gp", "rough", [True] * 3 + [False] * 3 + [True] * 1 + [False] * 3),
@@ -101,7 +101,7 @@ def test_the_table_says_which_edition_a_policy_was_trained_on(tmp_path: Path) ->
 
 
 def test_policies_on_other_tiles_are_not_compared(tmp_path: Path) -> None:
-    """As a stopped evaluation leaves them: all of tdgc, and of gp and cues what came in time."""
+    """A stopped evaluation left ``gp`` without a tile; only ``tdgc`` and ``cues`` are compared."""
     cues = [dataclasses.replace(e, policy="cues") for e in EPISODES if e.policy == "tdgc"]
     found = write_results(tmp_path, [*EPISODES[:-1], *cues])
     assert list(found["paired"]) == ["tdgc - cues"]
@@ -118,7 +118,7 @@ def test_the_table_has_gaps_where_cells_are_missing(tmp_path: Path) -> None:
         ["rough", "100.0%", "0.0%", "50.0%"],
         ["gap", "100.0%", "-", "100.0%"],
     ]
-    assert len({len(line) for line in lines[2:5]}) == 1  # in columns
+    assert len({len(line) for line in lines[2:5]}) == 1  # aligned in columns
 
 
 def test_results_that_cannot_be_written_leave_those_of_before(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Every reward term at states worked out by hand, and how terms become a reward."""
+"""Every reward term in states worked out by hand, and how terms combine into a reward."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ GEOMETRY = read_geometry(RobotConfig())
 
 
 def low_step(**changes: object) -> LowStep:
-    """Two robots that stand still, upright, with straight legs; mid-stance everywhere."""
+    """Two robots that stand still and upright on straight legs, with all feet in mid-stance."""
     phases = np.full((2, 4), 0.25)
     step = LowStep(
         state=RobotState.zeros(GEOMETRY, 2),
@@ -51,14 +51,14 @@ def low_step(**changes: object) -> LowStep:
 
 
 def set_command(step: LowStep, **values: float) -> LowStep:
-    """Commands of the second robot."""
+    """Set commands of the second robot."""
     for name, value in values.items():
         step.command[1, INDEX[name]] = value
     return step
 
 
 def turn(step: LowStep, roll: float, pitch: float, yaw: float) -> LowStep:
-    """Attitude of the second robot, by Bullet."""
+    """Set the attitude of the second robot from Bullet's Euler angles."""
     step.state.quaternion[1] = pybullet.getQuaternionFromEuler([roll, pitch, yaw])
     step.state.derive()
     return step
@@ -69,14 +69,14 @@ def turn(step: LowStep, roll: float, pitch: float, yaw: float) -> LowStep:
 
 def test_tracking_a_velocity() -> None:
     step = set_command(low_step(), vx=0.5, vy=-0.2)
-    # The first robot does as told; the second is off by (0.5, -0.2): e^2 = 0.29.
+    # The first robot follows its command; the second is off by (0.5, -0.2): e^2 = 0.29.
     np.testing.assert_allclose(rewards.track_lin_vel(step), [1.0, E(-0.29 / 0.25)], atol=1e-12)
     wide = dataclasses.replace(step, sigma_lin=1.0)
     np.testing.assert_allclose(rewards.track_lin_vel(wide), [1.0, E(-0.29)], atol=1e-12)
 
 
 def test_velocity_is_tracked_in_the_heading_frame() -> None:
-    """Facing +y with the nose down and moving along +y is going forward, whatever the pitch."""
+    """A robot that faces +y with its nose down and moves along +y moves straight forward."""
     step = set_command(low_step(), vx=0.8)
     step.state.lin_vel[1] = [0.0, 0.8, 0.5]
     turn(step, 0.0, 0.3, math.pi / 2)
@@ -112,7 +112,7 @@ def test_commanded_gravity_is_that_of_a_robot_so_turned(
 
 
 def test_signs_of_pitch_and_roll() -> None:
-    """Pitch positive is nose down, roll positive left side up."""
+    """Positive pitch is nose down, positive roll is left side up."""
     step = turn(low_step(), 0.0, 0.3, 0.5)
     assert (step.state.rotation[1] @ [1.0, 0.0, 0.0])[2] == pytest.approx(-math.sin(0.3))
     step = turn(low_step(), 0.2, 0.0, 0.5)
@@ -137,13 +137,13 @@ def test_vertical_velocity_and_tilt_rate() -> None:
     step.state.ang_vel[1] = [0.3, -0.4, 5.0]
     np.testing.assert_allclose(rewards.vertical_velocity(step), [0.0, 0.25], atol=1e-12)
     np.testing.assert_allclose(rewards.tilt_rate(step), [0.0, 0.25], atol=1e-12)
-    # Level a gait cycle ago as now; then nose up by 0.1 rad where it is nose down by 0.2 now.
+    # First level both now and a gait cycle ago; then nose down by 0.2 rad now, up by 0.1 before.
     np.testing.assert_allclose(rewards.nodding(step), [0.0, 0.0], atol=1e-12)
     before = np.array([[0.0, 0.0], [-math.sin(0.1), 0.0]])
     nods = turn(low_step(last_tilt=before), 0.0, 0.2, 0.0)
     change = (math.sin(0.2) + math.sin(0.1)) ** 2
     np.testing.assert_allclose(rewards.nodding(nods), [0.0, change], atol=1e-12)
-    # Rolled onto its left side, what turns about the world's z turns about the body's y.
+    # Rolled onto its right side, a turn about the world's z is one about the body's y.
     turn(step, math.pi / 2, 0.0, 0.0)
     np.testing.assert_allclose(rewards.tilt_rate(step), [0.0, 0.09 + 25.0], atol=1e-9)
 
@@ -152,7 +152,7 @@ def test_vertical_velocity_and_tilt_rate() -> None:
 
 
 def raibert(phase: float, duration: float = 0.5, frequency: float = 2.0, **command: float) -> Array:
-    """(4, 2) footholds of one robot, all feet at the same phase."""
+    """Footholds of one robot with all feet at the same phase, (4, 2) m."""
     step = set_command(low_step(), duration=duration, frequency=frequency, **command)
     return rewards.raibert_targets(step.command[1:], np.full((1, 4), phase))[0]
 
@@ -182,7 +182,7 @@ def test_raibert_travel_is_that_of_a_stance() -> None:
 
 
 def test_raibert_turning_left() -> None:
-    """At touch-down the left feet trail, the right ones lead, the front goes left, the rear right.
+    """At touch-down left feet trail and right ones lead; front feet shift left, rear ones right.
 
     The ground under a foot at r moves by -(omega x r): 1 rad/s for 0.25 s, half of it ahead.
     """
@@ -193,7 +193,7 @@ def test_raibert_turning_left() -> None:
 
 
 def test_a_foot_that_follows_raibert_stays_put_while_the_body_moves() -> None:
-    """Over a stance a foot's place in the world is the same up to second order in the turn."""
+    """Over a stance a foot's position in the world is constant to first order in the turn."""
     vx, vy, turning, stance = 0.6, -0.3, 0.4, 0.125
     places = []
     for phase in np.linspace(0.0, 0.5, 11):
@@ -214,7 +214,7 @@ def test_raibert_error_is_measured_in_the_heading_frame() -> None:
     expected, _ = foot_kinematics(GEOMETRY, pose[None], np.zeros((1, 12)))
     error = ((expected[0, :, :2] - RECTANGLE) ** 2).sum()
     np.testing.assert_allclose(rewards.raibert_foothold(step), [error, error], atol=1e-9)
-    # Mid-stance velocity asks for nothing; at touch-down the targets lead by 0.0833 m.
+    # In mid-stance a velocity shifts nothing; at touch-down the targets lead by 0.0833 m.
     set_command(step, vx=1.0)
     np.testing.assert_allclose(rewards.raibert_foothold(step)[1], error, atol=1e-9)
     step.phases[1] = 0.0
@@ -223,8 +223,8 @@ def test_raibert_error_is_measured_in_the_heading_frame() -> None:
 
 
 def test_swing_height() -> None:
-    """Robot 1: FL at mid-swing 0.01 m too low, FR half way up as it should be, rear in stance."""
-    phases = np.array([[0.25] * 4, [0.75, 7.0 / 12.0, 0.25, 0.25]])  # half a sine: 1 and 1/2
+    """Robot 1 has FL at mid-swing 0.01 m too low, FR correctly halfway up, rear feet in stance."""
+    phases = np.array([[0.25] * 4, [0.75, 7.0 / 12.0, 0.25, 0.25]])  # half sine: 1 and 1/2
     heights = np.full((2, 4), GEOMETRY.foot_radius)
     heights[1, 0] += 0.07
     heights[1, 1] += 0.04
@@ -288,7 +288,7 @@ def test_target_and_action_differences() -> None:
 def test_joint_limits_cost_beyond_nine_tenths_of_the_range() -> None:
     step = low_step()
     low, high = GEOMETRY.joint_limits.T
-    step.state.q[0] = (low + high) / 2 + 0.45 * (high - low)  # on the edge
+    step.state.q[0] = (low + high) / 2 + 0.45 * (high - low)  # at the soft limits
     step.state.q[1] = (low + high) / 2
     step.state.q[1, 0], step.state.q[1, 1] = high[0], low[1] - 0.1
     expected = 0.05 * (high[0] - low[0]) + 0.05 * (high[1] - low[1]) + 0.1
@@ -355,7 +355,7 @@ def test_a_share_of_the_penalties() -> None:
 
 
 def test_total_groups_by_the_sign_of_the_weight() -> None:
-    """A term belongs to the group of its weight, though its own value be of the other sign."""
+    """The sign of its weight decides a term's group, even if its value has the other sign."""
     terms = {"track_lin_vel": np.array([1.0]), "body_height": np.array([0.5])}
     rewarded = total(terms, LowRewardConfig(body_height=10.0), 0.02)
     np.testing.assert_allclose(rewarded, [0.02 * 1.5], atol=1e-15)
@@ -373,7 +373,7 @@ def test_a_perfect_step_earns_the_most_there_is() -> None:
 
 
 def test_desired_contact_of_a_trot_weighs_the_diagonal_in_swing() -> None:
-    """Trot at g = 0.25: FR and RL in mid-stance, FL and RR in mid-swing and pressing."""
+    """Trot at g = 0.25: FR and RL in mid-stance, FL and RR in mid-swing but pressing."""
     phases = np.array([[0.75, 0.25, 0.25, 0.75]] * 2)
     step = low_step(phases=phases, contact=desired_contact(phases))
     step.command[:, 12:] = gait_embedding(0)
@@ -385,7 +385,7 @@ def test_desired_contact_of_a_trot_weighs_the_diagonal_in_swing() -> None:
 
 
 def high_step(**changes: object) -> HighStep:
-    """Two robots at rest, 4 m from the goal and facing it, half of the time gone."""
+    """Two robots at rest, 4 m from the goal and facing it, halfway through the episode."""
     step = HighStep(
         distance=np.full(2, 4.0),
         heading_error=np.zeros(2),

@@ -1,4 +1,4 @@
-"""The robot's arithmetic against Bullet, and its URDF against what it says of itself."""
+"""The robot's kinematics against Bullet, its poses and motors; its URDF against its comments."""
 
 import dataclasses
 import math
@@ -39,12 +39,12 @@ from tdgc.sim.urdf import JOINTS, urdf_path
 
 CONFIG = RobotConfig()
 URDF, GEOMETRY = urdf_path(CONFIG), read_geometry(CONFIG)
-# The shipped robot in m; what is read from its URDF is compared with these in test_geometry.
+# Dimensions of the shipped robot in m; test_geometry checks that its URDF is read as these.
 HIP_X, HIP_Y, ABDUCTION, THIGH, CALF, FOOT_RADIUS = 0.183, 0.047, 0.08, 0.213, 0.213, 0.022
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Array:
-    """(1, 4), by Bullet."""
+    """Quaternion (1, 4), computed by Bullet."""
     return np.array([pybullet.getQuaternionFromEuler([roll, pitch, yaw])])
 
 
@@ -62,7 +62,7 @@ class Body:
         self.joints = {entry[1].decode(): entry[0] for entry in info}
 
     def set(self, state: RobotState) -> None:
-        """Take over the first robot of ``state``."""
+        """Set pose, joints and velocities to those of the first robot of ``state``."""
         body, where = self.body, {"physicsClientId": self.client}
         pose = state.position[0].tolist(), state.quaternion[0].tolist()
         pybullet.resetBasePositionAndOrientation(body, *pose, **where)
@@ -140,7 +140,7 @@ def test_legs_straight_down() -> None:
 
 
 def test_signs_of_the_joints() -> None:
-    """A positive thigh swings the foot back, a positive hip swings every foot to the left."""
+    """A positive thigh angle moves the foot back, a positive hip angle moves every foot left."""
     thigh, hip = np.zeros((1, 12)), np.zeros((1, 12))
     thigh[0, 1::3], hip[0, 0::3] = 0.3, 0.3
     feet, _ = foot_kinematics(GEOMETRY, thigh, np.zeros((1, 12)))
@@ -153,7 +153,7 @@ def test_signs_of_the_joints() -> None:
 
 
 def test_state_in_the_heading_frame() -> None:
-    """Facing left (+y), nose down: moving along +y is forward, along +x is to the right."""
+    """For a robot facing +y with its nose down, +y is forward and +x is to the right."""
     state = RobotState.zeros(GEOMETRY, 1)
     state.quaternion = quaternion(0.0, 0.2, math.pi / 2)
     state.lin_vel[0] = [0.3, 1.0, -0.2]
@@ -221,7 +221,7 @@ def test_joint_targets_scale_and_clip() -> None:
 
 
 def test_joint_targets_keep_from_the_limits() -> None:
-    """The calf's upper limit is -0.89 rad: at -1.5 and with 4 x 0.25 rad it is past it."""
+    """The calf's target of -1.5 + 4 x 0.25 rad stops 0.02 rad short of its limit of -0.89 rad."""
     pose, actions = nominal_pose(CONFIG)[None], np.full((1, 12), 4.0)
     targets = joint_targets(CONFIG, GEOMETRY, pose, actions)[0].reshape(4, 3)
     np.testing.assert_allclose(targets[:, 2], -0.89 - 0.02)
@@ -231,7 +231,7 @@ def test_joint_targets_keep_from_the_limits() -> None:
 
 
 def commands(n: int, **changed: float) -> Array:
-    """Default commands (n, 15) but for those named."""
+    """Default commands (n, 15), except for those named."""
     command = np.tile(default_command(), (n, 1))
     for name, value in changed.items():
         command[:, INDEX[name]] = value
@@ -290,31 +290,31 @@ def phases_of(rng: np.random.Generator, m: int) -> Array:
 
 
 def test_walking_pose_puts_feet_where_commands_say() -> None:
-    """Without a load: on Raibert's footholds under a level trunk, as high as asked in swing."""
+    """Unloaded and halfway through its ramp: half of Raibert's travel, half of the swing height."""
     stiff = dataclasses.replace(CONFIG, kp=1e12)
     rng = np.random.default_rng(0)
     ahead = phases_of(rng, 6)
     command = commands(
         6, vx=0.5, vy=-0.2, yaw_rate=0.6, frequency=3.0, stance_width=0.3, swing_height=0.12
     )
-    half = np.full(6, 0.5)  # of the first cycle
+    half = np.full(6, 0.5)  # of swing height and travel, as halfway through the first cycle
     pose = walking_pose(stiff, GEOMETRY, command, phases_of(rng, 6), ahead, half)
     feet, _ = foot_kinematics(GEOMETRY, pose, np.zeros((6, 12)))
     rest, _ = foot_kinematics(GEOMETRY, nominal_pose(CONFIG)[None], np.zeros((1, 12)))
     wider = 0.5 * (0.3 - default_command()[INDEX["stance_width"]])
     rest = rest + [[[0.0, wider, 0.0], [0.0, -wider, 0.0]] * 2]
     moved = feet - rest
-    # At 0.30 m, where the nominal pose without its load would stand at 0.324 m.
+    # The trunk is at 0.30 m, where the unloaded nominal pose would stand at 0.324 m.
     lift = nominal_height(CONFIG, GEOMETRY) - 0.30
     assert lift == pytest.approx(0.0238, abs=1e-4)
     np.testing.assert_allclose(moved[..., 2], lift + 0.06 * swing_profile(ahead), atol=1e-9)
-    lead = 0.5 * (np.abs(1.0 - 2.0 * ahead) - 0.5) / 6.0  # s, half of a stance of 1/6 s
+    lead = 0.5 * (np.abs(1.0 - 2.0 * ahead) - 0.5) / 6.0  # s, half the lead of a stance of 1/6 s
     np.testing.assert_allclose(moved[..., 0], lead * (0.5 - 0.6 * rest[..., 1]), atol=1e-9)
     np.testing.assert_allclose(moved[..., 1], lead * (-0.2 + 0.6 * rest[..., 0]), atol=1e-9)
 
 
 def test_walking_pose_turns_feet_about_the_trunk() -> None:
-    """In the world, with the trunk as asked, they are where they are under a level trunk."""
+    """With the trunk rotated as commanded, the feet are where they are under a level trunk."""
     stiff, stance = dataclasses.replace(CONFIG, kp=1e12), np.full((2, 4), 0.25)
     command = commands(2)
     command[1, INDEX["pitch"]], command[1, INDEX["roll"]] = 0.25, -0.15
@@ -346,7 +346,7 @@ def test_stance_loads_carry_the_robot_over_a_cycle(gait: int) -> None:
 
 
 def torque(error: float, speed: float, strength: float = 1.0) -> list[float]:
-    """Torque of hip, thigh and calf, alike in all legs."""
+    """Torques of hip, thigh and calf, after checking that all legs agree."""
     shape = (2, 12)
     made = pd_torque(
         np.full(shape, error), np.full(shape, speed), np.full((2, 1), strength), CONFIG
@@ -495,7 +495,7 @@ def test_left_and_right_are_mirror_images() -> None:
 
 
 def test_points_of_heading_frames_in_the_world() -> None:
-    """Ahead of a robot that looks to the left is +y, and to its left -x."""
+    """For a robot facing +y, ahead is +y and left is -x."""
     xy, yaw = np.array([[1.0, 2.0], [3.0, 0.0]]), np.array([0.5 * math.pi, math.pi])
     x, y = to_world(xy, yaw, np.array([[0.3, 0.0], [0.0, 0.1]]))
     np.testing.assert_allclose(x, [[1.0, 0.9], [2.7, 3.0]])

@@ -1,4 +1,4 @@
-"""The rules of an episode: the paper's three constants, how ends are told apart."""
+"""The rules of an episode: the paper's three constants, and how it can end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""States: arrays are taken back in place, or parted from the rest and joined again."""
+"""States: arrays are restored in place, or split from the rest and joined again."""
 
 import json
 
@@ -19,7 +19,7 @@ def test_arrays_are_filled_in_place() -> None:
 def test_what_does_not_fit_is_refused() -> None:
     speed = np.zeros((4, 3))
     with pytest.raises(ValueError, match=r"^'speed' has shape \(3,\), not \(4, 3\)$"):
-        fill({"speed": speed}, {"speed": np.ones(3)})  # though it could be broadcast
+        fill({"speed": speed}, {"speed": np.ones(3)})  # although it could be broadcast
     with pytest.raises(ValueError, match=r"^the state lacks 'speed'$"):
         fill({"speed": speed}, {"sped": speed})
     assert not speed.any()

@@ -1,4 +1,4 @@
-"""The house rules: where PyBullet is, which way imports point, what no file may mention."""
+"""House rules: where PyBullet is imported, which way imports point, what no file may mention."""
 
 import ast
 import os
@@ -17,8 +17,8 @@ import tdgc
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: From the ground up: rooms (folders) and modules that stand in none. A module imports from lower
-#: floors and from its own room only, so rooms on the same floor know nothing of each other.
+#: From the ground up, each floor's rooms: folders, and modules outside any folder. A module imports
+#: only from lower floors and from its own room, so rooms on the same floor are independent.
 FLOORS = (
     ("tdgc", "errors", "files", "state"),
     ("config",),
@@ -31,7 +31,7 @@ FLOORS = (
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 SCRIPTS = FLOORS[-2][-3:]
-#: Names that scripts of others import, each from where it is defined.
+#: Modules that other people's scripts import from -> where their names are defined, the names.
 DOORS = {
     "terrain": ("sim.terrain", {"make_tile"}),
     "commands": ("sim.commands", {"CommandDecoder"}),
@@ -43,7 +43,7 @@ DOORS = {
 
 
 def sources() -> dict[str, Path]:
-    """Module name, without the package, -> file: the package's modules and the scripts."""
+    """Files of the package's modules and of the scripts, by module name without the package."""
     package = ROOT / "tdgc"
     modules = {}
     for path in sorted(package.rglob("*.py")):
@@ -68,7 +68,7 @@ def imports(tree: ast.AST) -> Iterator[str]:
 
 
 def own(name: str) -> str | None:
-    """The module of this repository that a dotted name means, or None."""
+    """The module of this repository that a dotted name refers to, or None."""
     first, _, rest = name.partition(".")
     if first in SCRIPTS:
         return first
@@ -77,19 +77,19 @@ def own(name: str) -> str | None:
     module = rest
     while module and module not in MODULES:
         module = module.rpartition(".")[0]
-    # An installed copy of an earlier version would answer for a module that has moved.
+    # Without this check, an installed older version could hide that a module has moved.
     assert module or rest in ("", "__version__", "ENVIRONMENTS"), f"{name}: there is no such module"
     return module or "tdgc"
 
 
 def used(module: str) -> set[str]:
-    """The modules of this repository that one of them imports."""
+    """The modules of this repository that ``module`` imports."""
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     return {name for name in map(own, imports(tree)) if name is not None}
 
 
 def room(module: str) -> str:
-    """The folder a module stands in, or itself where it stands in none."""
+    """The folder of a module, or the module itself if it is outside any folder."""
     return module.partition(".")[0]
 
 
@@ -179,7 +179,7 @@ def test_rules_see_every_kind_of_import() -> None:
 
 
 def files() -> Iterator[Path]:
-    """Every file of the repository, without what tools and runs leave behind."""
+    """Every file of the repository, except what tools and runs leave behind."""
     left_behind = {"runs", "build", "dist", "__pycache__"}
     for folder, folders, names in os.walk(ROOT):
         folders[:] = [

@@ -19,20 +19,20 @@ def test_travel_cost_in_the_open_is_the_way_of_a_king() -> None:
     assert cost.shape == (81, 41) and step == 0.1 and left == 2.0
     assert cost[70, 20] == 0.0
     assert cost[10, 20] == pytest.approx(6.0)
-    assert cost[60, 10] == pytest.approx(np.sqrt(2.0))  # 1 m either way
+    assert cost[60, 10] == pytest.approx(np.sqrt(2.0))  # 1 m along each axis
     assert cost[50, 10] == pytest.approx(np.sqrt(2.0) + 1.0)
 
 
 def test_travel_cost_leads_around_a_wall() -> None:
-    # All but a metre, on the right.
+    # The wall leaves only a metre free, on the right.
     wall = np.array([[4.0, y, 0.2] for y in np.arange(3.1, 6.1, 0.1)])
     cost, _, _ = travel_cost(wall, 81, 2.0, np.array([7.0, 5.0]))
     straight = 6.0
-    assert straight + 1.0 < cost[10, 30] < straight + 5.0  # and not through it, at 30 a metre
+    assert straight + 1.0 < cost[10, 30] < straight + 5.0  # not through it, at 30 per metre
 
 
 class Course:
-    """Robots that stand where a test wants them, on a tile each."""
+    """Robots that a test places on a tile each, with a teacher."""
 
     def __init__(self, families: list[str], level: int) -> None:
         rng = np.random.default_rng(0)
@@ -80,7 +80,7 @@ def test_each_family_is_walked_in_its_style(course) -> None:
         assert row[INDEX["stance_width"]] == style.stance_width
         assert row[INDEX["body_height"]] == style.body_height
         assert gait_index(row) == (1 if family == "gap" else 0)
-    decoder = CommandDecoder()  # all of it can be said in actions
+    decoder = CommandDecoder()  # all commands can be expressed as actions
     np.testing.assert_allclose(decoder.decode(decoder.encode(commands)), commands)
 
 
@@ -130,7 +130,7 @@ def test_leaps_face_across_the_trenches_and_end_behind_them(course) -> None:
 
 def test_goes_around_a_pillar(course) -> None:
     course = course(["pillar"])
-    # More of it on the left.
+    # Its centre is left of the straight way, so the shorter way is on the right.
     course.field.features[0, 0] = Features(pillars=np.array([[3.05, 4.15, 0.4]]))
     course.teacher.begin(np.arange(1), course.goal)
     course.put(2.3)
@@ -142,7 +142,7 @@ def test_goes_around_a_pillar(course) -> None:
 def test_knows_both_ways_around_what_stands_before_it(course) -> None:
     course = course(["pillar", "stair"])
     pillars = np.array([[3.05, 4.0, 0.4], [3.05, 4.7, 0.3], [3.05, 3.4, 0.3]])
-    course.field.features[0, 0] = Features(pillars=pillars)  # a wall, shorter to the right
+    course.field.features[0, 0] = Features(pillars=pillars)  # a wall that ends sooner on the right
     course.teacher.begin(np.arange(2), course.goal)
     course.put(2.5)
     command, straight_on = course.commands()
@@ -150,11 +150,12 @@ def test_knows_both_ways_around_what_stands_before_it(course) -> None:
     assert command[INDEX["vy"]] < -0.3 and command[INDEX["yaw_rate"]] < -0.5
     assert other[INDEX["vy"]] > 0.3 and other[INDEX["yaw_rate"]] > 0.5
     np.testing.assert_array_equal(np.delete(other, WAY), np.delete(command, WAY))
-    # Around the wall's ends, 0.28 m from its pillars: 0.2 m more on the left, at up to 3 a metre.
+    # Around the wall's ends, 0.28 m from its pillars: the left way is 0.2 m longer, and near
+    # pillars a metre costs up to 3.
     assert 0.1 < course.teacher.dearer[0] < 0.6
     np.testing.assert_array_equal(same, straight_on)
     assert course.teacher.dearer[1] == 0.0
-    for x in (1.0, 4.0):  # afar and behind there is but one way
+    for x in (1.0, 4.0):  # far away and behind the wall there is only one way
         course.put(x)
         command = course.commands()
         np.testing.assert_array_equal(course.teacher.other, command)
@@ -170,7 +171,7 @@ def test_a_family_without_a_style_is_walked_straight_on(course) -> None:
 
 
 def test_leaps_over_trenches_between_other_ground(course) -> None:
-    """Walking until the trench comes in sight, and again once it is behind."""
+    """On Ditches the robot walks until it sees the trench, leaps, and then walks again."""
     course = course(["ditches", "gap"])
     trench = np.array([[4.0, 4.25]])
     course.field.features[0, 0] = Features(trenches=trench, pillars=np.array([[2.0, 4.6, 0.3]]))

@@ -97,13 +97,13 @@ def test_same_seed_same_tile(family):
 def test_layouts_differ_within_a_level_and_from_level_to_level(family):
     made = [tile(family, 1, seed).heights for seed in range(8)]
     different = {heights.tobytes() for heights in made}
-    assert len(different) == (2 if family == "tilt" else 8)  # a slope falls to either side
+    assert len(different) == (2 if family == "tilt" else 8)  # a slope falls left or right
     levels = {tile(family, level / 10, 3).heights.tobytes() for level in range(11)}
     assert len(levels) == 11
 
 
 def test_a_tile_of_a_height_map(tmp_path):
-    """The file's heights times the difficulty in the zone, blended in over 25 cm."""
+    """In the zone it has the file's heights times the difficulty, blended in over 25 cm."""
     x = np.arange(161) / 20
     heights = 0.5 + 0.1 * x[:, None] - 0.05 * x
     name = str(tmp_path / "ramp.npy")
@@ -111,7 +111,7 @@ def test_a_tile_of_a_height_map(tmp_path):
     made = tile(name, 0.4)
     assert made.family == name and made.parts == (name,)
     np.testing.assert_allclose(made.heights[30:131], 0.4 * heights[30:131], atol=1e-6)
-    np.testing.assert_allclose(made.heights[28], 0.4 * 0.6 * heights[28], atol=1e-6)  # 0.15 of 0.25
+    np.testing.assert_allclose(made.heights[28], 0.4 * 0.6 * heights[28], atol=1e-6)  # 0.15 / 0.25
     assert (made.heights[:26] == 0.0).all() and (made.heights[135:] == 0.0).all()
     np.testing.assert_array_equal(made.support, made.heights)
     starts = [make_tile(f, 1.0, tile_rng(0, f, 10, 0)).start[1] for f in (name, "rough")]
@@ -181,14 +181,14 @@ def test_rough_is_zero_mean_and_reaches_its_amplitude(difficulty, amplitude):
 
 
 def test_rough_is_bilinear_on_a_lattice_of_five_spacings():
-    """Second differences along x vanish between the nodes of one of the lattices, of each once."""
+    """Second differences along x vanish except at evenly spaced nodes, and all spacings occur."""
     found = set()
     for seed in range(40):
         zone = tile("rough", 1, seed).heights[30:131].astype(float)
         bends = np.abs(np.diff(zone, 2, axis=0)).max(axis=1) > 1e-6  # at samples 31 to 129
         spacings = set(np.diff(np.flatnonzero(bends)))
         found.add(min(spacings))
-        assert spacings <= {min(spacings)}  # nodes are evenly apart
+        assert spacings <= {min(spacings)}  # evenly spaced nodes
     assert found == {2, 3, 4, 5, 6}  # cells: 0.1 to 0.3 m
 
 
@@ -237,7 +237,7 @@ def test_clutter_has_low_steps_and_things_to_walk_around(difficulty, step):
         made = tile("clutter", difficulty, seed)
         ground = made.support.astype(float)
         rises = np.concatenate([np.diff(ground, axis=0).ravel(), np.diff(ground, axis=1).ravel()])
-        assert np.abs(rises).max() <= step + 0.05 * 3.0 * step + 1e-6  # and a cell of slope
+        assert np.abs(rises).max() <= step + 0.05 * 3.0 * step + 1e-6  # plus the slope of a cell
         x, y, d = made.features.pillars.T
         obstacle = made.heights != made.support
         assert set(np.unique(made.heights[obstacle])) <= {np.float32(0.8), np.float32(-0.6)}
@@ -245,7 +245,7 @@ def test_clutter_has_low_steps_and_things_to_walk_around(difficulty, step):
         away = np.hypot(0.05 * ix[:, None] - x, 0.05 * iy[:, None] - y) - d / 2
         assert (away.min(axis=1) <= 1e-9).all() if ix.size else len(x) == 0
         kinds.update(np.unique(made.heights[obstacle]).tolist() or ["none"])
-    assert kinds == {"none", *np.float32([0.8, -0.6]).tolist()}  # posts and walls, pits
+    assert kinds == {"none", *np.float32([0.8, -0.6]).tolist()}  # posts and walls; pits
 
 
 def test_ways_through_clutter_are_as_wide_as_between_pillars():
@@ -265,7 +265,7 @@ def test_ditches_are_trenches_before_or_behind_clutter():
         lips, x = made.features.trenches, made.features.pillars[:, 0]
         middle = lips.mean(axis=1)
         assert 1 <= len(lips) <= 4 and (np.diff(middle) >= 0.75 - 0.05).all()
-        for lip in lips:  # through, all across
+        for lip in lips:  # across the whole tile
             inside = made.heights[round(lip.mean() / 0.05)]
             assert (inside == np.float32(-0.6)).all()
         behind = made.parts == ("clutter", "gap")
@@ -286,17 +286,17 @@ def test_stairs(difficulty, step):
     counts = set()
     for seed in range(60):
         made = tile("stair", difficulty, seed)
-        assert (made.heights == made.heights[:, :1]).all()  # the same all across
+        assert (made.heights == made.heights[:, :1]).all()  # the same across the tile
         rise = np.diff(made.heights[:, 0].astype(float))
-        up, down = np.flatnonzero(rise > 1e-6), np.flatnonzero(rise < -1e-6)  # single cells
+        up, down = np.flatnonzero(rise > 1e-6), np.flatnonzero(rise < -1e-6)  # one cell each
         np.testing.assert_allclose(rise[up], step, atol=1e-6)
         np.testing.assert_allclose(rise[down], -step, atol=1e-6)
         assert len(up) == len(down) >= 5 and up[-1] < down[0]
         assert 30 <= up[0] and down[-1] <= 129  # in the zone
         treads = np.concatenate([np.diff(up), np.diff(down)])
         assert set(treads) <= {5, 6, 7, 8} and len(set(treads)) > 1
-        assert down[0] - up[-1] - 1 >= 6  # level samples between: 0.3 m
-        # No further step fits on either side.
+        assert down[0] - up[-1] - 1 >= 6  # level cells between: 0.3 m
+        # There is no room for another step on each side.
         assert down[-1] - up[0] + 1 + 10 > 100 - 16 and len(up) <= 10
         risers = made.features.risers
         np.testing.assert_allclose(risers[:, 0], 0.05 * (np.concatenate([up, down]) + 0.5))
@@ -319,7 +319,7 @@ def test_gap_trenches(level):
         centres = made.features.trenches.mean(axis=1)
         assert 3 <= len(centres) <= 5 and np.diff(centres).min() >= 0.75 - 1e-9
         assert centres.min() >= 1.8 - 1e-9 and centres.max() <= 6.2 + 1e-9
-        cells += list(rise - fall)  # at half depth
+        cells += list(rise - fall)  # width at half depth
         counts.add(len(centres))
         places += list(centres)
     assert set(cells) <= {math.floor(width / 0.05 + 1e-9), math.ceil(width / 0.05 - 1e-9)}
@@ -364,7 +364,7 @@ def test_a_mirrored_tile_has_left_and_right_exchanged(family, difficulty):
     assert turned.goal == pytest.approx([7.25, 8 - made.goal[1]])
     assert turned.features.slope == -made.features.slope
     np.testing.assert_array_equal(turned.features.trenches, made.features.trenches)
-    x, y, diameter = turned.features.pillars.T  # each is where its heights are
+    x, y, diameter = turned.features.pillars.T  # they match the heights
     grid = np.arange(161) * 0.05
     away = np.hypot(grid[:, None, None] - x, grid[None, :, None] - y) - diameter / 2
     if family == "pillar":
@@ -378,7 +378,7 @@ def test_a_mirrored_tile_has_left_and_right_exchanged(family, difficulty):
 
 
 def family_of(half: np.ndarray) -> str:
-    """Tell the family from the heights of half a zone at d = 0.8."""
+    """Identify the family from the heights of half a zone at d = 0.8."""
     if half.min() == np.float32(-0.6):
         return "gap"
     if (half == half[:, :1]).all():
@@ -400,13 +400,13 @@ def test_mixed_is_two_different_families_half_a_zone_each():
 
 
 def mixed_half(family: str, difficulty: float) -> np.ndarray:
-    """Heights of the first half, from the first tile that has `family` there."""
+    """Heights of the first half of the first tile that has ``family`` there."""
     seeds = (s for s in range(1000) if tile("mixed", difficulty, s).parts[0] == family)
     return tile("mixed", difficulty, next(seeds)).heights[:81]
 
 
 def test_mixed_halves_have_the_same_parameters():
-    rough_half = mixed_half("rough", 1)[30:76].astype(float)  # to where it blends out
+    rough_half = mixed_half("rough", 1)[30:76].astype(float)  # up to where it blends out
     assert np.abs(rough_half).max() == pytest.approx(0.10, rel=1e-6)
     assert abs(rough_half.mean()) < 1e-6
     assert count_blobs(mixed_half("pillar", 1) > 0) == 12  # half the zone, half of 24

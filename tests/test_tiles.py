@@ -1,4 +1,4 @@
-"""Training tiles: when they are drawn, and that their numbers are enough to draw them again."""
+"""Training tiles: when new ones are drawn, and that their numbers suffice to redraw them."""
 
 import dataclasses
 
@@ -38,14 +38,14 @@ def test_a_tile_serves_five_episodes_of_a_level() -> None:
     tiles.draw(ALL, LEVELS)
     first = [heights(tiles, robot) for robot in ALL]
     assert [tiles.begin(ALL, LEVELS).tolist() for _ in range(5)] == [[]] * 5
-    assert tiles.begin(np.array([1, 2]), LEVELS).tolist() == [2]  # what is flat stays
+    assert tiles.begin(np.array([1, 2]), LEVELS).tolist() == [2]  # flat tiles are not redrawn
     assert tiles.begin(np.array([2]), LEVELS).tolist() == []
     higher = LEVELS + [1, 1, 0]
     assert tiles.begin(ALL, higher).tolist() == [0]
     assert tiles.level[[0, 2]].tolist() == [5, 6] and tiles.number[[0, 2]].tolist() == [3, 2]
     changed = [(heights(tiles, robot) != first[robot]).any() for robot in ALL]
     assert changed == [True, False, True] and tiles.drawn == 4
-    # After five episodes other stairs of the level follow.
+    # After five episodes the robot gets another tile of the same level.
     seen = [tiles.begin(np.array([0]), higher).tolist() for _ in range(5)]
     assert seen == [[]] * 4 + [[0]] and tiles.number[0] == 4 and tiles.episodes[0] == 1
 

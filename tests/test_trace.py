@@ -1,4 +1,4 @@
-"""Traces: what they say is what happened; files come back as they were, or are refused."""
+"""Traces: they match what happened; files are read back unchanged, or refused."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 
 ROOT = Path(__file__).resolve().parents[1]
-HOLD = 5  # control steps a decision
+HOLD = 5  # control steps per decision
 
 
 class Notes(Tracer):
-    """A tracer that also notes each robot's states, control step by control step."""
+    """A tracer that also keeps each robot's state at every control step."""
 
     def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
         super().begin(cell, loco, field, goal)
@@ -64,7 +64,7 @@ class Notes(Tracer):
         }
 
     def over(self, decision: int, name: str, k: int) -> Array:
-        """A value of robot ``k`` in the control steps after a decision."""
+        """Values of ``name`` for robot ``k`` in the control steps after a decision."""
         first = HOLD * decision + 1
         return np.array([note[name][k] for note in self.seen[first : first + HOLD]])
 
@@ -72,7 +72,7 @@ class Notes(Tracer):
 def watch(driver: Driver, cell: Cell, low: Any) -> tuple[Notes, list[Trace], list[Episode]]:
     notes = Notes(driver, 5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluation, "HORIZON", 1.04)  # 52 control steps: the last decision is cut off
+        patch.setattr(evaluation, "HORIZON", 1.04)  # 52 steps: the last decision is cut short
         episodes = run_cell(cell, low, driver, 5, [notes])
     return notes, notes.traces(), episodes
 
@@ -89,7 +89,7 @@ def watched_high(low, tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="module")
 def watched(low, watched_high):
-    """The notes, traces and episodes of a high policy that is quick to change its mind."""
+    """The notes, traces and episodes of a high policy whose decisions change quickly."""
     driver = HierarchyDriver(*watched_high)
     return watch(driver, Cell("tdgc", "nominal", "rough", 8, 3, 2), low[0])
 
@@ -127,7 +127,7 @@ def test_decisions_are_those_of_the_policy_and_what_they_decode_to(watched):
         assert asked[:-1] == pytest.approx(np.array(given), abs=1e-6)
         done = [notes.seen[HOLD * decision + 1]["carried out"][k] for decision in range(11)]
         assert commands[:-1] == pytest.approx(np.array(done), abs=1e-6)
-        # Gaits change all the time here, and none begins below 3.5 Hz.
+        # Gaits change all the time here, and each begins at 3.5 Hz or faster.
         assert (t["command_frequency"] - t["asked_frequency"])[:-1].max() > 0.1
         assert t["gait"][:-1].tolist() == [GAITS[g] for g in decoder.gait(actions[:-1])]
         assert np.isnan(actions[-1]).all() and np.isnan(commands[-1]).all()
@@ -145,7 +145,7 @@ def test_commands_at_their_bounds_are_marked(low):
     marked = {name: set(t[f"at_bound_{name}"][:-1].tolist()) for name in CONTINUOUS}
     ends = {"vx": {1.0}, "vy": {-1.0}, "power_weight": {-1.0}}  # the last by default
     assert {name: marked.pop(name) for name in ends} == ends
-    del marked["yaw_rate"]  # whatever the goal asks
+    del marked["yaw_rate"]  # depends on the goal
     assert set().union(*marked.values()) == {0.0}
 
 
@@ -171,7 +171,7 @@ def test_it_says_where_the_probes_are(low, tmp_path, probes: str):
 
 
 def test_cues_are_those_of_the_condition(low, watched_high):
-    """With noise, probes are off by up to 2 cm and a decision late."""
+    """With noise, probes are off by up to 2 cm and one decision late."""
     driver = HierarchyDriver(*watched_high)
     notes, traces, _ = watch(driver, Cell("tdgc", "noise", "stair", 8, 3, 2), low[0])
     for k, t in enumerate(traces):
@@ -221,11 +221,11 @@ def test_energy_of_an_episode_is_its_power_over_time(watched):
     _, traces, episodes = watched
     for t, e in zip(traces, episodes, strict=True):
         assert e.energy_j == pytest.approx(np.sum(t["power"][1:] * t["seconds"][1:]), rel=1e-5)
-        assert e.energy_j > 10.0  # a second's walk of 12 kg
+        assert e.energy_j > 10.0  # 12 kg walking for a second
 
 
 def test_reward_terms_are_those_of_the_paper(watched):
-    """From the other columns by the formulas of Sec. IV-B."""
+    """They follow from the other columns by the formulas of Sec. IV-B."""
     notes, traces, _ = watched
     c, dt = HighRewardConfig(), 0.1
     low, high = np.array(dataclasses.astuple(CONFIG.commands)).T
@@ -267,7 +267,7 @@ def test_the_baseline_has_no_actions_and_no_cues(low):
 
 
 def test_robots_that_end_early_have_short_traces(low):
-    """Two robots whose motors are dead fall while the third goes on; each has its own time."""
+    """Two robots with dead motors fall while the third continues; each has its own end."""
 
     class Limp(BaselineDriver):
         def begin(self, loco: Locomotion, goal: Array, *told: Any) -> None:
@@ -343,7 +343,7 @@ def test_files_that_are_no_traces_are_refused(watched, tmp_path):
             trace.read(other)
     lacking = {k: v for k, v in meta.items() if k != b"seed"}
     pq.write_table(table.replace_schema_metadata(lacking), other)
-    with pytest.raises(TraceError, match=r"does not say which episode it is of$"):
+    with pytest.raises(TraceError, match=r"does not identify its episode$"):
         trace.read(other)
 
 
@@ -366,14 +366,14 @@ def test_a_damaged_file_is_refused_in_one_line(watched, tmp_path):
         except TraceError as error:
             assert "\n" not in str(error)
             refused += 1
-        else:  # in what is there twice, or says who wrote it; or in the words of the metadata
+        else:  # the bit was redundant, or in the writer's name or the words of the metadata
             assert all(np.array_equal(found[c.name], t[c.name], c.unit != "") for c in COLUMNS)
     assert refused > 20
 
 
 def test_no_half_file_is_left_behind(watched, tmp_path):
     t = watched[1][0]
-    (tmp_path / t.file_name).mkdir()  # so that the file cannot take its place
+    (tmp_path / t.file_name).mkdir()  # so that the file cannot replace it
     with pytest.raises(OSError):
         trace.write(t, tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [t.file_name]
@@ -416,10 +416,10 @@ def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
         (r["episode"], r["outcome"]) for r in failed
     ]
     assert "most is to be won in gap, by decisions: 100.0 points" in capsys.readouterr().out
-    # Fewer traces in the same folder: none of the old ones is left.
+    # Fewer traces in the same folder: the old ones are removed.
     assert evaluate.main([*flags, "--trace", "1"]) == 0
     assert [p.name for p in (tmp_path / "traces").iterdir()] == ["gp_nominal_gap_10_000.parquet"]
-    # Without traces the table is the same, and nothing claims to belong to it.
+    # Without traces the table is the same, and no stale diagnosis or trace remains.
     before = (tmp_path / "episodes.csv").read_bytes()
     assert evaluate.main(flags) == 0
     assert (tmp_path / "episodes.csv").read_bytes() == before

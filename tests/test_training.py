@@ -1,4 +1,4 @@
-"""Checkpoints, interruption, and a resumed run that ends as if it had never stopped."""
+"""Checkpoints, interruption, flags, and resumed runs that end as if they had never stopped."""
 
 import argparse
 import contextlib
@@ -65,7 +65,7 @@ def learner(seed: int, hidden: int = 8, steps: int = 32) -> PPO:
 
 
 def parameters(model: PPO) -> dict[str, th.Tensor]:
-    """Parameters and the optimiser's moments, as copies."""
+    """Copies of the parameters and of the optimiser's moments."""
     tensors = {k: v.clone() for k, v in model.policy.state_dict().items()}
     for index, slots in model.policy.optimizer.state_dict()["state"].items():
         tensors |= {f"{index}.{k}": th.as_tensor(v).clone() for k, v in slots.items()}
@@ -78,7 +78,7 @@ def draw() -> tuple[float, float, float]:
 
 def test_checkpoint_round_trip(tmp_path: Path) -> None:
     model = learner(seed=1)
-    np.random.normal()  # so that numpy holds back the second of a pair
+    np.random.normal()  # so that NumPy has cached the second value of a pair
     position = np.random.normal(size=(4, 3))
     state = {"epoch": 3, "robots": {"position": position}}
     path = Checkpoint.take(model, {"workers": [state], "phase": 1}).save(tmp_path)
@@ -107,7 +107,7 @@ def test_two_checkpoints_are_kept(tmp_path: Path) -> None:
 
 
 def three(folder: Path) -> list[Path]:
-    """A run's two newest checkpoints, and what is left of one that was not finished."""
+    """Save two checkpoints, returned oldest first, and leave the folder of an unfinished third."""
     model = learner(seed=0)
     made = []
     for steps in (10, 20):
@@ -195,7 +195,7 @@ def test_a_checkpoint_of_another_network(tmp_path: Path) -> None:
 
 @contextlib.contextmanager
 def no_file_larger_than(size: int) -> Iterator[None]:
-    """As if the disk had that much room."""
+    """Make writes beyond ``size`` bytes of a file fail, as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -219,7 +219,7 @@ def test_a_checkpoint_that_finds_no_room_leaves_those_before(tmp_path: Path) -> 
 def test_a_line_is_added_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     append_line(path, "first")
-    for size in (6, 9):  # no room, and room for a part
+    for size in (6, 9):  # no room; room for a part of the line
         with no_file_larger_than(size), pytest.raises(OSError):
             append_line(path, "second")
         assert path.read_text() == "first\n"
@@ -275,8 +275,10 @@ def test_a_signal_asks_to_stop_and_a_second_one_stops(number: signal.Signals) ->
 
 
 def test_the_policy_is_symmetric(tmp_path: Path) -> None:
-    """Mirrored observation, mirrored action, same value: before and after a change of weights,
-    and in the saved file."""
+    """A mirrored observation gives the mirrored action and the same value, for any weights.
+
+    The saved policy gives the same actions.
+    """
     config = LowTrainConfig().env
     mirror, actor_dim = low_mirror(config), width(actor_layout(config.robot, config.gyro))
     policy = AsymmetricActorCriticPolicy(
@@ -315,7 +317,7 @@ TINY = [
 
 
 def at_calls(monkeypatch: pytest.MonkeyPatch, act: Callable[[int, Interruption], None]) -> None:
-    """Call ``act(n, interruption)`` where a run asks for the n-th time whether to go on."""
+    """Call ``act(n, interruption)`` when a run checks for the n-th time whether to stop."""
     calls = 0
 
     def due(interruption: Interruption) -> bool:
@@ -328,7 +330,7 @@ def at_calls(monkeypatch: pytest.MonkeyPatch, act: Callable[[int, Interruption],
 
 
 def kill_run(script: str, arguments: list[str], last: Path, after: float = 0.0) -> None:
-    """Start a run and kill it ``after`` so many seconds since the checkpoint ``last`` is there."""
+    """Start a run and kill it ``after`` seconds after the checkpoint ``last`` has appeared."""
     process = subprocess.Popen(
         [sys.executable, script, *arguments],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -337,7 +339,7 @@ def kill_run(script: str, arguments: list[str], last: Path, after: float = 0.0) 
         time.sleep(0.01)
     time.sleep(after)
     process.kill()
-    output, _ = process.communicate(timeout=300.0)  # which the workers hold open, too
+    output, _ = process.communicate(timeout=300.0)  # the workers hold the pipe open, too
     assert process.returncode == -signal.SIGKILL, output.decode()
 
 
@@ -346,8 +348,10 @@ def newest(run: Path) -> Path:
 
 
 def final(run: Path) -> dict[str, Any]:
-    """What a run ended with, but for the wall time: the learner's whole state, the policy, the
-    counters, the workers' states."""
+    """The final state of a run: the learner, the counters, the workers and the policy.
+
+    The wall time is left out, and so is the checksum, which covers it.
+    """
     header = Checkpoint.read(newest(run)).header
     timed = ("seconds", "sha256")
     return {
@@ -368,9 +372,12 @@ def rows(run: Path) -> list[dict[str, Any]]:
 def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Five updates with half of the robots on tiles, in the middle of episodes. The first run
-    writes no checkpoint on its way. The second is stopped after the first update, killed, loses its
-    newest checkpoint, and goes on from the one before."""
+    """A stopped, killed and resumed run ends in exactly the state of an uninterrupted one.
+
+    Each makes five updates, with half of the robots on tiles. The first run writes no checkpoint
+    before its end. The second is stopped after the first update, in the middle of episodes, and
+    killed later; it loses its newest checkpoint and continues from the one before.
+    """
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert train_low.main([*TINY, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     names = sorted(path.name for path in (whole / "checkpoints").iterdir())
@@ -397,7 +404,7 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     assert stopped.steps == 32 and stopped.header["phase"] == 0
     under_way = [state["lengths"] for state in stopped.workers()]
     assert 0 < np.max(under_way) < 20  # of episodes of 20 steps
-    # Flags that it cannot go on with leave it as it is.
+    # Flags that the run cannot continue with leave its configuration unchanged.
     config = (broken / "config.json").read_text(encoding="utf-8")
     assert train_low.main(["--resume", "--out", str(broken), "--n-envs", "6"]) == 2
     assert (broken / "config.json").read_text(encoding="utf-8") == config
@@ -409,7 +416,7 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     assert "its checksum does not match" in "".join(capfd.readouterr())
     assert final(broken) == final(whole)
 
-    # A finished run has nothing left to do; more steps than its own go on from its end.
+    # Resuming a finished run changes nothing.
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
     assert final(broken) == final(whole)
 
@@ -417,9 +424,12 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
 def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Five updates of the recurrent learner, which remembers the episodes under way: two of
-    imitation and three of reinforcement learning. The second run has a checkpoint after each, is
-    stopped after the first and killed in the middle of the fourth's rollout."""
+    """A stopped, killed and resumed run of the high policy ends like an uninterrupted one.
+
+    Each makes five updates of the recurrent learner, two of imitation and three of reinforcement
+    learning, and keeps the LSTM states of the current episodes. The second run writes a checkpoint
+    after each update, is stopped after the first and killed during the rollout of the fourth.
+    """
     arguments = [
         "--seed", "3", "--n-envs", "2", "--workers", "1", "--steps", "40",
         "--set", "checkpoint_seconds=0", "--set", "log_steps=16", "--set", "ppo.n_steps=4",
@@ -430,19 +440,19 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         "--set", "imitation.kept=2",
         "--set", 'env.families=["rough","pillar"]',
     ]  # fmt: skip
-    monkeypatch.chdir(ROOT)  # the shipped low policy is named from there
+    monkeypatch.chdir(ROOT)  # where ``kill_run`` starts the resumed run
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert (
         train_high.main([*arguments, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     )
     assert [row["steps"] for row in rows(whole)] == [16, 32, 40]
-    # What imitation gave stays beside what came of it.
+    # The policy at the end of imitation is kept beside the final one.
     imitated, learned = (policies.load(whole / name) for name in ("imitation", "policy"))
     assert (imitated.meta["steps"], learned.meta["steps"]) == (16, 40)
-    # Levels are drawn while imitating; then all are the hardest, and no episode has ended yet.
+    # Imitation draws levels at random. Afterwards all start at the hardest, and none has moved yet.
     assert [rows(whole)[1][f"level/{family}"] for family in ("rough", "pillar")] == [10.0, 10.0]
-    # Half way from 2e-3 to 2e-4 in imitation; after 24 of 40 steps and in the end from 1.5e-4 to
-    # 5e-5.
+    # In imitation, halfway from 2e-3 to 2e-4. Then, on the way from 1.5e-4 to 5e-5, after 24 of 40
+    # steps and at the end.
     rates = [row["train/learning_rate"] for row in rows(whole)]
     assert rates == pytest.approx([1.1e-3, 5e-5 + 0.4 * 1e-4, 5e-5])
     last = broken / "checkpoints/step-000000000024"
@@ -451,7 +461,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         assert train_high.main([*arguments, "--out", str(broken)]) == 0
     stopped = Checkpoint.read(newest(broken))
     assert stopped.steps == 8 and stopped.header["phase"] == 0
-    # It goes on with the low policy that it began with.
+    # It only continues with the low policy that it began with.
     config = (broken / "config.json").read_text(encoding="utf-8")
     other = tmp_path / "other"
     low = policies.load(PRETRAINED / "low")
@@ -464,7 +474,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     cut = Checkpoint.read(newest(broken))
     assert cut.steps < 40
     (state,) = cut.workers()
-    assert state["lengths"].max() > 0  # episodes have 7 decisions, so the third update cuts them
+    assert state["lengths"].max() > 0  # updates come every 4 decisions, within episodes of 7
     assert cut.tensors["lstm.pi.h"].any()
     assert train_high.main(["--resume", "--out", str(broken)]) == 0
     assert final(broken) == final(whole)
@@ -473,8 +483,10 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
 def test_from_scratch_on_terrain_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bumps that no family has and no teacher knows. A feed-forward policy whose run is stopped
-    while noise of the gait is held ends as one that never stopped."""
+    """A feed-forward policy trains without a teacher on a height map that no family has.
+
+    A run stopped while the noise of the gait is held resumes and ends like an uninterrupted one.
+    """
     x, y = np.meshgrid(np.linspace(0.0, 8.0, 161), np.linspace(0.0, 8.0, 161), indexing="ij")
     bumps = tmp_path / "bumps.npy"
     np.save(bumps, 0.1 * np.sin(2.0 * np.pi * x / 1.6) * np.cos(2.0 * np.pi * y / 1.6))
@@ -510,7 +522,7 @@ def test_from_scratch_on_terrain_of_ones_own(
 def test_calibration_ends_a_run_of_the_low_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Its copy takes the policy's place. One that is interrupted ends the same when it goes on."""
+    """The calibrated copy replaces the policy; an interrupted run ends the same once resumed."""
     monkeypatch.setattr(calibration, "_EPOCHS", 2)
     monkeypatch.setattr(calibration, "_CORRECTIONS", 4)
     arguments = [*TINY, "--steps", "32", "--set", "calibration.robots=64"]
@@ -537,7 +549,7 @@ def test_calibration_ends_a_run_of_the_low_policy(
 def test_faults_of_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A full disk, a killed worker, a stop; then workers that are killed again and again."""
+    """A run survives a full disk, a killed worker and a stop, but not workers that keep dying."""
     arguments = [
         *TINY, "--n-envs", "2", "--workers", "1", "--steps", "160", "--out", str(tmp_path),
         "--set", "checkpoint_seconds=0", "--set", "log_steps=16",
@@ -565,7 +577,7 @@ def test_faults_of_a_run(
     assert "no log row at 32 steps: [Errno 27] File too large" in output
     seed = worker_seed(3, 0, 1)
     assert f"worker 0 died (exit code -9); restarted with seed {seed} (restart 1)" in output
-    assert f"stopped by the test; --resume --out {tmp_path} goes on" in output
+    assert f"stopped by the test; continue with --resume --out {tmp_path}" in output
     names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert names == ["step-000000000048", "step-000000000064"]
     assert [row["steps"] for row in rows(tmp_path)] == [16, 48, 64]
@@ -681,7 +693,7 @@ def test_flags_come_after_a_preset(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (config["env"]["decimation"], config["ppo"]["lstm"]) == (1, 8)
     for flags in (["--preset", "paper"], ["--no-teacher"], ["--init", "x"]):
         assert train_high.main(["--resume", *flags, *out]) == 2
-        assert "train_high.py: --resume goes on " in capsys.readouterr().err
+        assert "train_high.py: --resume keeps " in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         train_high.main(["--no-teacher", "--preset", "paper", *out])
 
@@ -696,7 +708,10 @@ def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many as there are cores and robots for them; a run goes on with as many as it began."""
+    """``auto`` is one worker per core, with at least 10 robots each.
+
+    A resumed run keeps its number of workers, unless a flag gives another.
+    """
     parser = argparse.ArgumentParser()
     add_arguments(parser, str(tmp_path), LowTrainConfig(), "control steps")
 
@@ -717,7 +732,7 @@ def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_low_policy_is_what_the_first_command_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Once it is calibrated; the shipped one until then."""
+    """``find_low`` takes the low policy of runs/low once it is calibrated, else the shipped one."""
     shipped = str(PRETRAINED / "low")
     low = policies.load(shipped)
     monkeypatch.chdir(tmp_path)
@@ -735,21 +750,24 @@ def test_the_low_policy_is_what_the_first_command_left(
 def test_a_run_with_another_robot_takes_what_fits_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """But what was assigned; the shipped robot's settings stay as they are."""
+    """Settings that are not assigned are fitted to another robot, but not to the shipped one."""
     urdf = tmp_path / "heavy.urdf"
     shipped = (ROOT / "urdf" / "quadruped.urdf").read_text(encoding="utf-8")
     urdf.write_text(shipped.replace('<mass value="5.6"/>', '<mass value="11.9"/>'))
     assigned = [f"env.robot.urdf={urdf}", "env.robot.kd=0.7"]
     config = train_low.fit(with_overrides(LowTrainConfig(), assigned), assigned)
     robot = config.env.robot
-    assert (robot.kp, robot.kd, robot.base_height) == (30.0, 0.7, 0.3)  # 18.9 instead of 12.6 kg
+    assert (robot.kp, robot.kd, robot.base_height) == (30.0, 0.7, 0.3)  # kp: 20 * 18.9 kg / 12.6 kg
     assert robot.torque_limit == (23.7, 23.7, 35.5)
     assert "env.robot.kp=30.0" in "".join(capsys.readouterr())
     assert train_low.fit(LowTrainConfig(), ["env.robot.kp=25"]) == LowTrainConfig()
 
 
 def test_robots_of_a_run() -> None:
-    """Some on a plane, whose physics step is as long as a torque is held, the others on tiles."""
+    """The MDPs on the plane and on tiles differ only in terrain and physics step.
+
+    On the plane, a physics step is as long as a torque is held: 4 per control step.
+    """
     config = with_overrides(LowTrainConfig(), ["steps=80"])
     (phase,) = train_low.phases(config, "cpu")
     assert phase.until == 80

@@ -1,4 +1,4 @@
-"""Tuning: what a limit does to commands, what is refused, and the comparison with no tuning."""
+"""Tuning: what limits do to commands, what is refused, and the effect compared with none."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def pair(low, tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="module")
 def loco(low):
-    """Twenty robots, each turned and posed in its own way, so that each gets its own commands."""
+    """Twenty robots, each with its own heading and pose, so that each gets its own commands."""
     m = 20
     robots = Locomotion(m, low[1].robot, low[1].physics, None)
     rng = np.random.default_rng(0)
@@ -62,7 +62,7 @@ def loco(low):
 
 
 def commands(driver: HierarchyDriver, loco: Locomotion, steps: int = 1) -> Array:
-    """Commands (steps, 20, 15) of robots that stay as they are."""
+    """Commands (steps, 20, 15) of robots whose state does not change."""
     driver.begin(loco, np.tile([6.5, 0.0], (loco.num_robots, 1)), "rough")
     return np.array([driver.command(step).copy() for step in range(steps)])
 
@@ -81,7 +81,7 @@ def test_a_bound_clips_and_does_not_rescale(pair, loco):
     expected[:, INDEX["vx"]] = np.minimum(free[:, INDEX["vx"]], 0.5)
     expected[:, INDEX["vy"]] = np.maximum(free[:, INDEX["vy"]], -0.1)
     assert limited == pytest.approx(expected, abs=1e-12)
-    assert 0 < np.count_nonzero(limited != free) < 40  # some were clipped, the others are as before
+    assert 0 < np.count_nonzero(limited != free) < 40  # some are clipped, the others unchanged
 
 
 def test_only_allowed_gaits_the_nearest_on_the_action(pair, loco):
@@ -102,7 +102,7 @@ def test_only_allowed_gaits_the_nearest_on_the_action(pair, loco):
 def test_a_decision_is_held_as_long_as_the_rate_says(rate, held, pair, loco):
     said = commands(tuned(pair, f"decision_rate={rate}"), loco, 2 * held + 1)
     changed = np.flatnonzero((said[1:] != said[:-1]).any(axis=(1, 2))) + 1
-    assert changed.tolist() == [held, 2 * held]  # its memory makes each decision another one
+    assert changed.tolist() == [held, 2 * held]  # the hidden state makes decisions differ
 
 
 def test_too_fast_is_shortened_and_keeps_its_direction(pair, loco):
@@ -124,7 +124,7 @@ def test_tilted_robots_are_slowed_at_every_control_step(pair, loco):
     state.quaternion[:] = [np.sin(angle / 2), 0.0, 0.0, np.cos(angle / 2)]
     state.derive()
     try:
-        tilted = driver.command(1)  # no decision falls here
+        tilted = driver.command(1)  # no decision at this step
         expected = free.copy()
         expected[:, :3] *= 0.5
         assert tilted == pytest.approx(expected)
@@ -134,7 +134,7 @@ def test_tilted_robots_are_slowed_at_every_control_step(pair, loco):
 
 
 def test_a_gait_begins_no_faster_than_its_bound(pair, loco):
-    """The robot's start frequency of 3.5 Hz gives way to a lower bound."""
+    """A bound below the robot's start frequency of 3.5 Hz takes precedence."""
     assert loco.robot.start_frequency == 3.5
     for assignment, most in (("decoder.frequency.high=2.5", 2.5), ("decoder.vx.high=0.4", 3.5)):
         driver = tuned(pair, assignment)
@@ -146,7 +146,7 @@ def test_a_gait_begins_no_faster_than_its_bound(pair, loco):
 
 
 def test_the_policy_sees_its_own_decisions(pair, loco):
-    """A limit changes the robot's commands and not what the policy takes for its last action."""
+    """A limit changes the robot's commands but not the last action that the policy observes."""
     free, limited = HierarchyDriver(*pair), tuned(pair, "decoder.vx.high=-0.9")
     commands(free, loco, 11)
     commands(limited, loco, 11)
@@ -228,7 +228,7 @@ def test_every_command_has_limits_and_they_are_its_own():
         ('{"safety": {"max_speed": Infinity}}', "'safety.max_speed' must be a finite number"),
         ('{"safety": {"max_speed": 1e999}}', "'safety.max_speed' must be a finite number"),
         ('{"decision_rate": 1%s}' % ("0" * 400), "'decision_rate' must be a finite number"),
-        ('{"decision_rate": 5, "decision_rate": 10}', "the key 'decision_rate' stands twice"),
+        ('{"decision_rate": 5, "decision_rate": 10}', "the key 'decision_rate' appears twice"),
         ('{"a\\nb\\u2028c": 1}', r"unknown configuration key 'a\\nb\\u2028c'"),
     ],
 )
@@ -344,7 +344,7 @@ def test_the_script_shows_both_beside_each_other(tmp_path, capsys):
     assert effect["tdgc-tuned"]["mean_speed"] < 0.8 * effect["tdgc"]["mean_speed"]
     speed = f"{effect['tdgc-tuned']['mean_speed']:.2f} m/s"
     assert speed in capsys.readouterr().out
-    # The next run in this folder has no tuning, and nothing claims that it had.
+    # The next run in this folder has no tuning, so the file is removed.
     assert evaluate.main([*flags[:-4], "--policies", "gp", "--out", str(tmp_path)]) == 0
     assert not (tmp_path / "tuning.json").exists()
 

@@ -1,4 +1,4 @@
-"""Worker processes: what they compute is what the tasks compute, and how they fail."""
+"""Worker processes: they compute what the tasks compute, and how they fail."""
 
 import functools
 import multiprocessing
@@ -29,9 +29,9 @@ def make_robots(robots: int, seed: int) -> LowLevelTask:
 
 
 class Counter:
-    """Robot i of n ends every i + 2 steps: terminated if i is even, truncated otherwise.
+    """A task in which robot i ends every i + 2 steps: terminated if i is even, else truncated.
 
-    It sees its own number, the steps of its episode, and the last reward, which is the sum of
+    A robot observes its number, the steps of its episode, and its last reward, which is the sum of
     its actions.
     """
 
@@ -101,14 +101,14 @@ SPACES = (Counter.observation_space, Counter.action_space)
 
 @pytest.fixture(scope="module")
 def counters() -> Iterator[TaskVecEnv]:
-    """Five robots in two workers, two and three."""
+    """Five robots in two workers, two in the first and three in the second."""
     env = TaskVecEnv(make_counter, 5, 2, seed=3, spaces=SPACES)
     yield env
     env.close()
 
 
 def test_workers_compute_what_the_tasks_do() -> None:
-    """Two workers with two robots each, through the ends of episodes, to the last bit."""
+    """Two workers with two robots each agree bit for bit, also where episodes end."""
     tasks = [make_robots(2, worker_seed(7, k)) for k in range(2)]
     spaces = tasks[0].observation_space, tasks[0].action_space
     env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
@@ -153,14 +153,16 @@ def test_workers_compute_what_the_tasks_do() -> None:
 
 
 def steps(env: TaskVecEnv, number: int) -> list[Any]:
-    """What steps with one and the same action give."""
+    """Results of ``number`` steps, all with the same action."""
     gone = [env.step(np.full((4, 12), 0.3, np.float32)) for _ in range(number)]
     return [(o.tolist(), r.tolist(), d.tolist(), str(infos)) for o, r, d, infos in gone]
 
 
 def test_other_workers_go_on_from_the_states() -> None:
-    """In the middle of episodes, some of which end: the same observations, noise and all, rewards,
-    ends and returns."""
+    """From the middle of episodes, 20 steps give the same noisy observations, rewards and returns.
+
+    Some of the episodes end within them.
+    """
     probe = make_robots(1, 0)
     spaces = probe.observation_space, probe.action_space
     probe.close()
@@ -181,7 +183,7 @@ def test_other_workers_go_on_from_the_states() -> None:
 
 
 def test_ends_of_episodes(counters: TaskVecEnv) -> None:
-    """Numbers within a worker are 0, 1 and 0, 1, 2; they end after 2, 3 and 2, 3, 4 steps."""
+    """Robots 0, 1 and 0, 1, 2 of the two workers end after 2, 3 and 2, 3, 4 steps."""
     first = counters.reset()
     assert first.tolist() == [[i, 0.0, 0.0] for i in (0, 1, 0, 1, 2)]
     assert first.dtype == np.float32
@@ -209,7 +211,7 @@ def test_ends_of_episodes(counters: TaskVecEnv) -> None:
     assert infos[4]["TimeLimit.truncated"] is False
     assert infos[4]["episode"] == {"r": pytest.approx(5 * sums[4]), "l": 4}
     assert infos[0]["episode"]["r"] == pytest.approx(3 * sums[0])
-    # What was handed out is the caller's own.
+    # Results are copies, which later steps do not change.
     assert (kept[:, 1] == 1.0).all()
     assert infos[4]["terminal_observation"][1] == 4.0
 
@@ -226,12 +228,12 @@ def test_reset_begins_all_returns_anew(counters: TaskVecEnv) -> None:
 def test_statistics_and_states_of_each_worker(counters: TaskVecEnv) -> None:
     stats = counters.stats()
     assert [s["robots"] for s in stats] == [2.0, 3.0]
-    assert all(10.0 < s["memory_mb"] < 1000.0 for s in stats)  # numpy, and little beside it
+    assert all(10.0 < s["memory_mb"] < 1000.0 for s in stats)  # little more than numpy
     states = counters.state_dicts()
     assert [s["seed"] for s in states] == [worker_seed(3, 0), worker_seed(3, 1)]
     assert [s["restarts"] for s in states] == [0, 0]
     counters.step(np.ones((5, 2), dtype=np.float32))
-    counters.load_state_dicts([{"worlds": 50}, {"worlds": 60}])  # as old checkpoints have them
+    counters.load_state_dicts([{"worlds": 50}, {"worlds": 60}])  # as in old checkpoints
     assert [s["worlds"] for s in counters.stats()] == [51.0, 61.0]
     assert counters.starts().all() and (counters.seen()[:, 1:] == 0.0).all()
     with pytest.raises(ValueError, match=r"^states of 1 workers do not fit 2$"):
@@ -263,7 +265,7 @@ if __name__ == "__main__":
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 def test_workers_have_no_torch(tmp_path: Path) -> None:
-    """The low policy's have none, nor do they import the script, unless the task is from there."""
+    """Workers of the low policy do not import PyTorch, nor a script unless it defines the task."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
@@ -304,7 +306,7 @@ def test_worker_seeds() -> None:
     seeds = [worker_seed(s, k, n) for s in range(20) for k in range(4) for n in range(3)]
     assert len(set(seeds)) == 240
     assert all(0 <= seed < 2**32 for seed in seeds)
-    # Of a first start, as checkpoints of older runs expect them.
+    # The seed of a first start, as checkpoints of older runs expect it.
     assert worker_seed(3, 1) == worker_seed(3, 1, 0) == 457190280
 
 
@@ -328,7 +330,7 @@ def test_workers_that_raise_or_are_killed_are_named_and_close_leaves_none() -> N
     pids = set(env.worker_pids)
     env.close()
     assert not pids & {process.pid for process in multiprocessing.active_children()}
-    env.close()  # once more does no harm
+    env.close()  # closing again is harmless
 
 
 def test_a_worker_that_cannot_start_takes_the_others_with_it() -> None:

@@ -1,4 +1,4 @@
-"""Bullet worlds: the ground is where numpy says, robots weigh and act alone, nothing leaks."""
+"""Bullet worlds: the ground matches numpy, forces are right, robots are independent, no leaks."""
 
 import dataclasses
 import hashlib
@@ -25,7 +25,7 @@ ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()
 GEOMETRY, NOMINAL = read_geometry(ROBOT), nominal_pose(ROBOT)
 MASS = 12.6  # kg
 G = 9.81
-#: Trunk above the soles in the nominal pose, m.
+#: Height of the trunk above the soles in the nominal pose, m.
 STAND = (
     GEOMETRY.foot_radius
     - foot_kinematics(GEOMETRY, NOMINAL[None], np.zeros((1, 12)))[0][0, :, 2].min()
@@ -34,7 +34,7 @@ UPSIDE_DOWN = np.array([[1.0, 0.0, 0.0, 0.0]])
 
 
 def put(world: World, xy: Array, height: float = STAND, yaw: float = 0.0) -> None:
-    """All robots at ``xy`` (M, 2), their trunks ``height`` above z = 0."""
+    """Place all robots in the nominal pose at ``xy`` (M, 2) m, trunks ``height`` m above z = 0."""
     m = world.num_robots
     position = np.column_stack([np.broadcast_to(xy, (m, 2)), np.full(m, height)])
     quaternion = yaw_quaternion(np.full(m, yaw))
@@ -42,7 +42,7 @@ def put(world: World, xy: Array, height: float = STAND, yaw: float = 0.0) -> Non
 
 
 def hold(world: World, steps: int = 1, targets: Array | None = None) -> None:
-    """Control steps without delay or offset, by default at the nominal pose."""
+    """Run control steps without delay or offset, by default with the nominal pose as target."""
     m = world.num_robots
     wanted = np.broadcast_to(NOMINAL if targets is None else targets, (3, m, 12))
     for _ in range(steps):
@@ -50,7 +50,7 @@ def hold(world: World, steps: int = 1, targets: Array | None = None) -> None:
 
 
 def snapshot(world: World) -> Array:
-    """(M, n) everything that was measured."""
+    """Everything measured in the last step, one row per robot, (M, n)."""
     s = world.state
     flat = [s.position, s.quaternion, s.lin_vel, s.ang_vel, s.q, s.qd, s.torque]
     return np.column_stack([*flat, s.foot_force, s.leg_force, s.trunk_force])
@@ -58,7 +58,7 @@ def snapshot(world: World) -> Array:
 
 @pytest.fixture
 def plane() -> Iterator[World]:
-    """One robot that stands on a plane."""
+    """One robot standing on a plane."""
     world = World(1, ROBOT, PHYSICS)
     put(world, np.zeros(2))
     yield world
@@ -66,7 +66,7 @@ def plane() -> Iterator[World]:
 
 
 def tiles(families: list[str], level: int = 10, crop: float = 2.0, seed: int = 0) -> TileField:
-    """A field with a row a robot."""
+    """A field with one row per robot and one tile per row."""
     field = TileField((len(families), 1), crop=crop)
     for i, family in enumerate(families):
         field.place(i, 0, make_tile(family, level / 10, tile_rng(seed, family, level, i)))
@@ -77,7 +77,7 @@ def tiles(families: list[str], level: int = 10, crop: float = 2.0, seed: int = 0
 
 
 def assert_rays_hit_the_field(world: World, seed: int) -> None:
-    """Rays straight down, each in the client that holds the robot's row."""
+    """Check that rays straight down, in the client that holds each row, hit the field's heights."""
     field, rng = world.field, np.random.default_rng(seed)
     assert field is not None
     for row in range(world.num_robots):
@@ -86,7 +86,7 @@ def assert_rays_hit_the_field(world: World, seed: int) -> None:
         heights = field.height_at(xy[:, 0], xy[:, 1])
         ends = np.full((200, 1), 3.0)
         client = world._client_of[row]
-        client.setCollisionFilterGroupMask(client.ground, -1, 1, -1)  # rays are not robots
+        client.setCollisionFilterGroupMask(client.ground, -1, 1, -1)  # let rays hit it
         hits = client.rayTestBatch(np.hstack([xy, ends]).tolist(), np.hstack([xy, -ends]).tolist())
         assert {hit[0] for hit in hits} == {client.ground}
         client.setCollisionFilterGroupMask(client.ground, -1, 1, 2)
@@ -95,7 +95,7 @@ def assert_rays_hit_the_field(world: World, seed: int) -> None:
 
 
 def test_heightfield_is_where_numpy_says() -> None:
-    """Two tiles in one client, of families that are not symmetric in any way."""
+    """Rays hit the heights of two tiles in one client, of families without any symmetry."""
     world = World(2, ROBOT, PHYSICS, tiles(["rough", "pillar"], crop=0.0))
     assert len(world._clients) == 1
     assert_rays_hit_the_field(world, 0)
@@ -113,7 +113,7 @@ def test_heightfield_of_several_clients_and_after_a_redraw() -> None:
         field.place(row, 0, make_tile(family, 0.8, np.random.default_rng(row)))
     world.upload_terrain()
     assert_rays_hit_the_field(world, 2)
-    # One tile of the second client.
+    # Redraw a single tile, in the second client.
     before = field.heights.copy()
     field.place(7, 0, make_tile("tilt", 1.2, np.random.default_rng(99)))
     assert (field.heights != before).any()
@@ -131,7 +131,7 @@ def test_a_field_that_never_changes_is_uploaded_as_flat_as_it_is() -> None:
         for client in world._clients:
             heights = field.heights[client.samples]
             (_, _, low), (_, _, high) = client.getAABB(client.ground)
-            # Bullet's box has a margin of a few cm. Redrawable fields reach from -2.1 to 2.1 m.
+            # Bullet's box has a margin of a few cm. That of a redrawable field spans -2.5 to 2.5 m.
             assert low == pytest.approx(heights.min(), abs=0.05)
             assert high == pytest.approx(heights.max(), abs=0.05)
         world.close()
@@ -148,7 +148,7 @@ def test_a_robot_walks_alike_on_a_field_that_never_changes() -> None:
 
 
 def test_a_robot_stands_on_its_own_tile_in_every_client() -> None:
-    """Eleven flat tiles, each at another height."""
+    """On eleven flat tiles of different heights, each robot stands 0.28 m above its own."""
     ground = np.linspace(-0.5, 0.5, 11)
     field = TileField((11, 1), crop=2.9)
     field.heights += np.repeat(ground, 161)[:, None].astype(np.float32)
@@ -194,7 +194,7 @@ def test_fields_that_do_not_fit() -> None:
 
 
 def resident() -> float:
-    """MB of memory of this process."""
+    """Resident memory of this process in MiB."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
@@ -223,7 +223,7 @@ def test_free_fall_and_state_of_the_last_step(plane: World) -> None:
     hold(plane, 5)
     state, n, dt = plane.state, 40, PHYSICS.dt
     assert state.lin_vel[0].tolist() == pytest.approx([0.0, 0.0, -G * n * dt], abs=1e-9)
-    # Bullet moves with the new speed: the sum of 1..n of g dt^2.
+    # Bullet moves with the new speed in each step: g dt^2 times the sum of 1..n.
     fallen = G * dt * dt * n * (n + 1) / 2
     assert state.position[0].tolist() == pytest.approx([1.0, 2.0, 5.0 - fallen], abs=1e-9)
     np.testing.assert_allclose(state.q[0], NOMINAL, atol=1e-9)
@@ -232,7 +232,7 @@ def test_free_fall_and_state_of_the_last_step(plane: World) -> None:
 
 
 def mean_foot_force(world: World, steps: int = 25) -> Array:
-    """(M, 4) N."""
+    """Mean force on each foot over ``steps`` control steps, (M, 4) N."""
     total = np.zeros((world.num_robots, 4))
     for _ in range(steps):
         hold(world)
@@ -241,7 +241,7 @@ def mean_foot_force(world: World, steps: int = 25) -> Array:
 
 
 def test_a_standing_robot_presses_with_its_weight(plane: World) -> None:
-    hold(plane, 200)  # it sways on its soft joints for a while
+    hold(plane, 200)  # it sways on its soft joints at first
     force = mean_foot_force(plane)[0]
     assert force.sum() == pytest.approx(MASS * G, rel=0.01)
     assert (force > 0.15 * MASS * G).all()
@@ -249,7 +249,7 @@ def test_a_standing_robot_presses_with_its_weight(plane: World) -> None:
     assert (state.leg_force == 0.0).all() and state.trunk_force[0] == 0.0
     assert state.position[0, 2] == pytest.approx(0.28, abs=0.02)
     assert np.abs(state.lin_vel).max() < 0.02 and np.abs(state.gravity[0, :2]).max() < 0.05
-    # Static: what the motors give is what the load asks for.
+    # At rest, the motors apply only the torque that the load requires.
     limit = np.tile(ROBOT.torque_limit, 4)
     assert (np.abs(state.torque[0]) < 0.5 * limit).all() and np.abs(state.torque[0]).max() > 3.0
 
@@ -263,7 +263,7 @@ def test_payload_adds_its_weight(plane: World, payload: float) -> None:
     assert mass == pytest.approx(GEOMETRY.trunk_mass + payload)
     nominal = np.array([0.016147, 0.068159, 0.073013])
     np.testing.assert_allclose(inertia, nominal * mass / GEOMETRY.trunk_mass, rtol=1e-6)
-    # Not on top of the last payload.
+    # A new payload replaces the last one instead of adding to it.
     plane.set_dynamics([0], np.array([0.8]), np.array([0.0]), np.zeros(1))
     mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
     assert mass == pytest.approx(GEOMETRY.trunk_mass)
@@ -279,7 +279,7 @@ def test_all_links_have_the_friction_of_the_physics_until_they_are_given_another
 
 
 def test_armature_is_inertia_about_the_joints(plane: World) -> None:
-    """Of each leg's links about the axis of their joint, and not on top of the last one."""
+    """It adds to each link's inertia about its joint's axis, and a new value replaces the last."""
     client, body = plane._client_of[0], plane._bodies[0]
 
     def inertia() -> Array:
@@ -294,7 +294,7 @@ def test_armature_is_inertia_about_the_joints(plane: World) -> None:
 
 
 def test_joint_friction_holds_a_joint_back(plane: World) -> None:
-    """A leg that is let go in the air swings less far with friction in its joints."""
+    """With the motors off, joints released in the air at 3 rad/s move less far with friction."""
     swung = []
     for friction in (0.0, 0.3):
         put(plane, np.zeros(2), 5.0)
@@ -308,7 +308,7 @@ def test_joint_friction_holds_a_joint_back(plane: World) -> None:
 
 @pytest.mark.parametrize("friction", [0.4, 0.8])
 def test_friction_slows_a_sliding_robot(plane: World, friction: float) -> None:
-    """On its back and pushed at 1 m/s, the robot loses mu g of its speed each second."""
+    """Lying on its back and pushed at 1 m/s, the robot loses speed at a rate of mu g."""
     plane.set_dynamics([0], np.array([friction]), np.array([0.0]), np.zeros(1))
     plane.reset_robots([0], np.array([[0.0, 0.0, 0.056]]), UPSIDE_DOWN, NOMINAL[None])
     hold(plane, 15)
@@ -346,7 +346,7 @@ def test_a_robot_dropped_on_its_back_hits_with_its_trunk(plane: World) -> None:
 
 
 def test_a_robot_on_its_knees_presses_with_its_legs(plane: World) -> None:
-    """Calves folded up: the knees carry, and no foot is blamed for it."""
+    """With the calves folded up the knees carry the load, and none of it counts as foot force."""
     folded = np.tile([0.0, 0.0, -2.7], 4)
     upright = yaw_quaternion(np.zeros(1))
     plane.reset_robots([0], np.array([[0.0, 0.0, 0.236]]), upright, folded[None])
@@ -378,7 +378,7 @@ def test_motor_strength_scales_torque() -> None:
     world.strength[1] = 0.5
     world.physics = PhysicsConfig(
         control_dt=0.0025, substeps=1, hold=1
-    )  # the first physics step alone
+    )  # the first physics step only
     hold(world, 1, NOMINAL + 0.2)
     np.testing.assert_allclose(world.state.torque[0], 4.0, atol=1e-9)  # 20 N m/rad
     np.testing.assert_allclose(world.state.torque[1], 2.0, atol=1e-9)
@@ -386,7 +386,7 @@ def test_motor_strength_scales_torque() -> None:
 
 
 def test_joints_keep_their_speed_limits_in_the_air(plane: World) -> None:
-    """Legs thrown from end to end of their range."""
+    """As the legs swing between extremes, some joint exceeds 12 rad/s but none 30 rad/s."""
     put(plane, np.zeros(2), height=20.0)
     fastest = np.zeros(12)
     for k in range(40):
@@ -408,7 +408,7 @@ def test_joint_offset_shifts_where_the_motors_pull(plane: World) -> None:
 
 
 def free_spot(field: TileField, row: int, rng: np.random.Generator) -> Array:
-    """A point of the challenge zone without a pillar within 0.45 m."""
+    """Draw a point in the challenge zone with no pillar within 0.45 m."""
     angle, radius = np.meshgrid(np.linspace(0.0, 2 * math.pi, 24), np.linspace(0.0, 0.45, 10))
     around = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     while True:
@@ -420,7 +420,7 @@ def free_spot(field: TileField, row: int, rng: np.random.Generator) -> Array:
 
 
 def sinking(family: str, seed: int) -> tuple[int, int]:
-    """Foot samples on the tile, and those more than 1 cm below its surface."""
+    """Number of foot samples on the tile, and of those more than 1 cm below its surface."""
     robots, index, rng = 16, np.arange(16), np.random.default_rng(seed)
     field = tiles([family] * robots, crop=1.0, seed=seed)
     loco = Locomotion(robots, ROBOT, PHYSICS, field)
@@ -446,10 +446,13 @@ def sinking(family: str, seed: int) -> tuple[int, int]:
 
 @pytest.mark.parametrize("family", ALL_FAMILIES)
 def test_feet_do_not_sink(family: str) -> None:
-    """Level 10, actions drawn anew each control step from all of their range: at most 0.1 % of
-    foot samples are more than 1 cm below the surface, on stairs, where risers catch feet, 0.15 %
-    (0.12 % of nine seeds). Robots that fall or leave their tile start again elsewhere. Three seeds
-    together: one foot caught in a wall is 0.1 % of one seed's."""
+    """At most 0.1 % of foot samples are more than 1 cm below the surface of level 10.
+
+    Actions are drawn from their full range at every control step; robots that fall or leave their
+    tile restart elsewhere. On stairs, where risers catch feet, the limit is 0.15 % (0.12 % measured
+    over nine seeds). Three seeds are pooled, because a single foot caught in a wall makes up 0.1 %
+    of one seed's samples.
+    """
     samples, sunk = np.sum([sinking(family, seed) for seed in (10, 11, 12)], axis=0)
     assert samples > 46_500
     assert sunk <= (0.0015 if family == "stair" else 0.001) * samples
@@ -459,7 +462,7 @@ def test_feet_do_not_sink(family: str) -> None:
 
 
 def drive(delay: float, late: int, steps: int = 12) -> Array:
-    """(steps, n) of a robot on a plane with random targets, shifted ``late`` control steps."""
+    """Snapshots (steps, n) of a robot on a plane, with random targets delayed by ``late`` steps."""
     world = World(1, ROBOT, PHYSICS)
     put(world, np.zeros(2))
     drawn = np.random.default_rng(0).uniform(-0.5, 0.5, (steps, 12)) + NOMINAL
@@ -481,7 +484,7 @@ def test_a_delay_of_a_control_step_is_a_target_a_step_older() -> None:
 
 
 def test_a_delay_within_a_control_step() -> None:
-    """10 ms: the first four of eight physics steps still act on the older target."""
+    """With a delay of 10 ms, the first four of eight physics steps still use the older target."""
     world = World(1, ROBOT, PhysicsConfig(control_dt=0.02, substeps=8))
     put(world, np.zeros(2), height=5.0)
     old, new = NOMINAL, NOMINAL + 0.3
@@ -500,7 +503,7 @@ def test_a_delay_within_a_control_step() -> None:
 
 
 def test_robots_do_not_touch_each_other() -> None:
-    """Two robots on one spot stand exactly as one does."""
+    """Two robots in the same spot stand exactly as a single one does."""
     both, alone = World(2, ROBOT, PHYSICS), World(1, ROBOT, PHYSICS)
     for world in (both, alone):
         put(world, np.zeros(2))
@@ -516,7 +519,7 @@ def test_robots_do_not_touch_each_other() -> None:
 def trajectory(
     world: World, robot: int, others: float = 1.0, steps: int = 40, seed: int = 0
 ) -> Array:
-    """(steps, n) of one robot under random targets; the others' targets are scaled."""
+    """Snapshots (steps, n) of one robot under random targets; ``others`` scales everyone else's."""
     m, rng = world.num_robots, np.random.default_rng(seed)
     xy = np.column_stack([0.75 + 0.0 * np.arange(m), 0.5 * np.arange(m)])
     if world.field is not None:
@@ -537,7 +540,7 @@ def trajectory(
 
 @pytest.mark.parametrize("terrain", [False, True])
 def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> None:
-    """Robots that stumble about, in two clients, to the last bit; else they do not."""
+    """Robots that stumble in two clients move alike to the last bit, but not without ``forget``."""
     m, rng = CLIENT_ROBOTS + 1, np.random.default_rng(0)
     field = tiles((["rough", "stair", "gap"] * m)[:m], level=6) if terrain else None
     world = World(m, ROBOT, PHYSICS, field)
@@ -550,7 +553,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
     world.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0), np.full(m, 0.01))
 
     def stumble(worlds: list[World], steps: int) -> bool:
-        """Whether all of them do the same."""
+        """Step all worlds with the same random targets; return whether they stay identical."""
         alike = True
         for _ in range(steps):
             targets = NOMINAL + rng.uniform(-0.6, 0.6, (3, m, 12))
@@ -586,7 +589,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
 
 @pytest.mark.parametrize("robots", [5, 11])
 def test_a_robot_does_not_depend_on_the_others(robots: int) -> None:
-    """The last of 5 in a client, and the last of 11 in two."""
+    """The last of 5 robots in one client, and of 11 in two, moves the same whatever the rest do."""
     one = trajectory(World(robots, ROBOT, PHYSICS), robots - 1)
     np.testing.assert_array_equal(
         trajectory(World(robots, ROBOT, PHYSICS), robots - 1, others=-0.5), one

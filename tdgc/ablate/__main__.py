@@ -199,7 +199,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"tdgc.ablate: {error}", file=sys.stderr)
         return 1
     if not finished:
-        print("stopped; the same command goes on")
+        print("stopped; run the same command to continue")
     failed = {trial.name: message for trial, message in found.items() if isinstance(message, str)}
     for name, message in failed.items():
         print(f"tdgc.ablate: {name}: {message}", file=sys.stderr)

@@ -134,7 +134,7 @@ class Runner:
             whole = self.out / f"{WHOLE}-{trial.seed}"
             high = whole / "policy"
             if not (whole / "cell.json").is_file():
-                raise TrialError(f"it needs '{WHOLE}' with seed {trial.seed}, which is not done")
+                raise TrialError(f"it needs '{WHOLE}' with seed {trial.seed}, which is missing")
         self._seconds_left()
         began = time.monotonic()
         folder.mkdir(parents=True, exist_ok=True)

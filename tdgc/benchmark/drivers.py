@@ -240,7 +240,7 @@ def load_high(
         trained_on = recorded(LowLevelConfig, high.meta["low"]["config"], f"{path}, meta.low")
         observation = high.meta["low"]["observation"]
     except (KeyError, TypeError) as error:
-        raise ConfigError(f"{path}: its meta lacks what it was trained on") from error
+        raise ConfigError(f"{path}: its metadata do not say what it was trained on") from error
     for field in fields(RobotConfig):
         wanted, given = (getattr(c.robot, field.name) for c in (trained_on, low_config))
         if wanted != given:

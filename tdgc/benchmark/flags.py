@@ -25,16 +25,16 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
     Levels and families are None if not given, until ``read`` fills in the defaults, so that a
     script can reject them where they would have no effect.
     """
-    titles = "episodes", "policies", "what is looked at", "machine"
+    titles = "episodes", "policies", "output", "machine"
     groups = Groups(*map(parser.add_argument_group, titles))
     add = groups.episodes.add_argument
-    add("--levels", help="e.g. 6-10 or 0,5,10 (6-10)")
+    add("--levels", help="levels, e.g. 6-10 or 0,5,10 (6-10)")
     add(
         "--families",
         help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING} (all)",
     )
-    add("--episodes", type=int, default=100, help="per cell (100)")
-    add("--seed", type=int, default=0, help="of the evaluation's tiles (0)")
+    add("--episodes", type=int, default=100, help="episodes per cell (100)")
+    add("--seed", type=int, default=0, help="seed of the tiles (0)")
     groups.looked_at.add_argument("--out", type=Path, default=Path(out), help=f"results ({out})")
     groups.looked_at.add_argument(
         "--video",

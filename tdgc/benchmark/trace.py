@@ -446,7 +446,7 @@ def read(path: str | Path) -> Trace:
     try:
         head = {f.name: int(meta[f.name]) if f.type is int else meta[f.name] for f in _META}
     except (KeyError, ValueError) as error:
-        raise TraceError(f"{path}: does not say which episode it is of") from error
+        raise TraceError(f"{path}: does not identify its episode") from error
     columns = {c.name: table[c.name].to_numpy(zero_copy_only=False) for c in COLUMNS}
     trace = Trace(**head, columns=columns)  # type: ignore[arg-type]
     if "\0" in trace.file_name or Path(trace.file_name).name != trace.file_name:

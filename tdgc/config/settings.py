@@ -64,7 +64,7 @@ def read_json(path: Path) -> Any:
         if len(table) < len(pairs):
             keys = [key for key, _ in pairs]
             twice = next(key for key in keys if keys.count(key) > 1)
-            raise ConfigError(f"{path}: the key '{twice}' stands twice")
+            raise ConfigError(f"{path}: the key '{twice}' appears twice")
         return table
 
     try:

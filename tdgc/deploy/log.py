@@ -177,7 +177,7 @@ def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
             continue
         mine = places.setdefault(name, {})
         if int(number) in mine:
-            raise LogError(f"{path}: the column '{column}' stands twice")
+            raise LogError(f"{path}: the column '{column}' appears twice")
         mine[int(number)] = place
     table = {}
     for name, mine in places.items():

@@ -98,7 +98,7 @@ class Checkpoint:
                 raise CheckpointError(f"{path}: not a tdgc checkpoint of version {_VERSION}")
             for counter in ("num_timesteps", "n_updates"):
                 if type(header.get(counter)) is not int or not 0 <= header[counter] < 2**63:
-                    raise CheckpointError(f"{path}: '{counter}' is no count")
+                    raise CheckpointError(f"{path}: '{counter}' is not a count")
             if _checksum(data, header) != header["sha256"]:
                 raise CheckpointError(f"{path}: its checksum does not match, it is damaged")
             return cls(safetensors.torch.load(data), header)

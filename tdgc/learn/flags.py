@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, uni
     """
     default = to_dict(config)
     training = parser.add_argument_group("training")
-    training.add_argument("--steps", type=int, help=f"{unit} altogether ({default['steps']})")
+    training.add_argument("--steps", type=int, help=f"total number of {unit} ({default['steps']})")
     training.add_argument("--n-envs", type=int, help=f"number of robots ({default['n_envs']})")
     training.add_argument("--seed", type=int, help=f"random seed ({default['seed']})")
     training.add_argument(
@@ -66,7 +66,7 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     check_device(args.device)
     if args.resume:
         if args.init is not None:
-            raise ConfigError("--resume goes on with the policy of its run: no --init")
+            raise ConfigError("--resume keeps the run's policy: no --init")
         if not stored.is_file():
             raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
         try:

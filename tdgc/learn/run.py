@@ -76,7 +76,7 @@ class Interruption:
 
     def tell(self, run: Path) -> None:
         """Print what stopped the run in the folder ``run`` and how to resume it."""
-        tqdm.write(f"stopped by {self.reason}; --resume --out {run} goes on")
+        tqdm.write(f"stopped by {self.reason}; continue with --resume --out {run}")
 
 
 @dataclass(frozen=True)

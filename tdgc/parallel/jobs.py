@@ -26,7 +26,7 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
         try:
             yield from pool.map(work, jobs)
         except BrokenProcessPool:
-            raise WorkerError("a process died, perhaps for want of memory") from None
+            raise WorkerError("a process died, perhaps out of memory") from None
         except BaseException:  # the jobs under way are no longer needed
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(mp.active_children()) - others:

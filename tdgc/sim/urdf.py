@@ -274,7 +274,7 @@ def _parts(
     placed: dict[str, list[Part]] = {}
     for carrier in carriers:
         if carrier not in links:
-            raise ConfigError(f"a joint moves the link {reprlib.repr(carrier)}, which is not there")
+            raise ConfigError(f"a joint moves the link {reprlib.repr(carrier)}, which is missing")
         mine = placed[carrier] = [Part(links.pop(carrier), np.zeros(3), np.eye(3))]
         for above in mine:  # grows here, so that chains are followed
             for joint in fixed:

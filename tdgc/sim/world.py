@@ -229,7 +229,7 @@ class World:
             )
         except pybullet.error as error:  # a missing mesh, an element it cannot read
             path = urdf_path(self.robot)
-            raise ConfigError(f"{path}: Bullet cannot load it and says why above") from error
+            raise ConfigError(f"{path}: Bullet cannot load it, see above") from error
         links = range(client.getNumJoints(body))
         found = {client.getJointInfo(body, link)[1].decode(): link for link in links}
         self._joints = [found[name] for name in JOINTS]
