@@ -2,9 +2,9 @@
 
     python -m tdgc.diagnose run.npz --export runs/export --outcome fell
 
-Prints the diagnosis, writes it and the trace to the results folder, and reports whether the joint
-targets in the log are those of the graphs. What only a simulator knows is null in the trace, and
-the diagnosis lists what was unknown.
+Prints the diagnosis, writes it and the trace to the results folder, and reports whether the
+decisions, clock, commands and joint targets in the log are those of the graphs. What only a
+simulator knows is null in the trace, and the diagnosis lists what was unknown.
 """
 
 import argparse
@@ -38,9 +38,10 @@ def main(arguments: list[str] | None = None) -> int:
         geometry = read_geometry(controller.robot())
         found = log.read(args.log, controller)
         episode = log.trace(found, controller, args.outcome)
+        compared = log.replay(found, controller)
         args.out.mkdir(parents=True, exist_ok=True)
+        (args.out / "diagnosis.csv").unlink(missing_ok=True)  # of an earlier run
         path = trace.write(episode, args.out)
-        largest, first = log.replay(found, controller)
         failure = None
         if episode.outcome != "reached":
             failure = diagnosis.diagnose(episode, float(geometry.hips[0, 0]))
@@ -51,14 +52,20 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"{found.name}: {episode.outcome} after {episode['time'][-1]:.2f} s; trace in {path}")
     if failure is not None:
         print(f"{failure.layer}: {failure.cause}\n{failure.evidence}")
-    if first < float("inf"):
+    differ = [
+        f"{name} from {first:.2f} s on, by up to {largest:.3f}"
+        for name, (largest, first) in compared.items()
+        if first < float("inf")
+    ]
+    if differ:
         print(
-            f"tdgc.diagnose: joint targets are not what the graphs give, from {first:.2f} s on, by "
-            f"up to {largest:.3f} rad: a value was not handed on, or the graphs are other ones",
+            f"tdgc.diagnose: not what the graphs give: {'; '.join(differ)}: a value was not handed "
+            "on or not logged as it was, or the graphs are other ones",
             file=sys.stderr,
         )
         return 1
-    print(f"joint targets are what the graphs give, to {largest:.1e} rad")
+    largest = max(off for off, _ in compared.values())
+    print(f"{', '.join(compared)} are what the graphs give, to {largest:.1e}")
     return 0
 
 

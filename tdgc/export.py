@@ -5,9 +5,10 @@
 A graph holds everything between a robot's sensors and its joint targets: observation (Sec. IV-A,
 IV-B), network, decoder, phase clock and joint targets. Next to ``low.onnx`` and ``low.pt``,
 ``low_interface.json`` describes the inputs and outputs with their order and units, and how the
-joints are driven; likewise for ``high``, with the task. The robot's URDF is copied there too. After
-writing, each pair of graphs drives a robot in the simulator for the length of an episode, from the
-folder alone (``tdgc.deploy``), and its outputs are compared with those of the policies.
+joints are driven; likewise for ``high``, with the task. The robot's URDF and meshes are copied
+there too. After writing, each pair of graphs drives a robot in the simulator for the length of an
+episode, from the folder alone (``tdgc.deploy``), and its outputs are compared with those of the
+policies.
 """
 
 import argparse
@@ -26,7 +27,7 @@ import torch as th
 
 from tdgc import __version__
 from tdgc.benchmark.drivers import HierarchyDriver, load_high
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig
+from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
 from tdgc.deploy.controller import FORMATS, Controller, quiet
 from tdgc.deploy.graphs import HighGraph, LowGraph, Signal
 from tdgc.deploy.interface import VERSION, Table, interface_path
@@ -40,7 +41,7 @@ from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
 from tdgc.sim.terrain import TileField, make_tile
-from tdgc.sim.urdf import JOINTS, urdf_path
+from tdgc.sim.urdf import JOINTS, mesh_path, read_urdf
 from tdgc.sim.world import World
 from tdgc.tasks.high_observation import SEMANTIC
 from tdgc.tasks.pairing import PRETRAINED, load_low
@@ -88,14 +89,14 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
     return Pair(low_policy, low_config, high_policy, high_config)
 
 
-def interfaces(pair: Pair, low: LowGraph, high: HighGraph) -> dict[str, Table]:
+def interfaces(pair: Pair, low: LowGraph, high: HighGraph, urdf: Path) -> dict[str, Table]:
     """Contents of the two interface files by graph, except ``files``.
 
-    Their schema is ``tdgc/deploy/interface.schema.json``.
+    Their schema is ``tdgc/deploy/interface.schema.json``; ``urdf`` is the exported folder's copy.
     """
     config, task = pair.low_config, pair.high_config
     robot, physics = config.robot, config.physics
-    geometry, urdf = read_geometry(robot), urdf_path(robot)
+    geometry = read_geometry(robot)
     joint_hz = physics.joint_steps / physics.control_dt
     gaits = [
         {"name": gait, **dict(zip(NAMES[12:], row, strict=True))}
@@ -108,6 +109,7 @@ def interfaces(pair: Pair, low: LowGraph, high: HighGraph) -> dict[str, Table]:
         "feet": FEET,
         "frames": {
             "trunk": "ahead, left, up",
+            "origin": "origin of the URDF's root link",
             "gravity_when_level": _quantity("1", [0.0, 0.0, -1.0]),
         },
         "robot": {
@@ -204,16 +206,18 @@ def _commands(ranges: CommandRanges) -> list[Table]:
 
 
 def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
-    """Write the graphs and interface files of both policies and the URDF to an existing ``folder``.
+    """Write the graphs and interface files of both policies and the robot.
 
-    Graphs that an earlier export left there in other formats are deleted.
+    ``folder`` must exist; graphs that an earlier export left there in other formats are deleted.
 
     Raises:
+        ConfigError: the robot's URDF cannot be used or names a mesh that is missing.
         OSError: a file cannot be written.
     """
     low = LowGraph(pair.low, pair.low_config)
     high = HighGraph(pair.high, pair.high_config, pair.low_config)
-    tables = interfaces(pair, low, high)
+    urdf = _copy_robot(pair.low_config.robot, folder)
+    tables = interfaces(pair, low, high, urdf)
     for name, graph in (("low", low), ("high", high)):
         files = {}
         for form, suffix in FORMATS.items():
@@ -224,7 +228,6 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
                 files[form] = _file(path)
         text = json.dumps(tables[name] | {"files": files}, indent=2) + "\n"
         interface_path(folder, name).write_text(text, encoding="utf-8")
-    _copy_robot(urdf_path(pair.low_config.robot), folder)
 
 
 def _file(path: Path) -> Table:
@@ -232,14 +235,31 @@ def _file(path: Path) -> Table:
     return {"file": path.name, "sha256": checksum(path)}
 
 
-def _copy_robot(urdf: Path, folder: Path) -> None:
-    """Copy a URDF and those of its meshes that lie in its folder or below."""
-    shutil.copyfile(urdf, folder / urdf.name)
-    for mesh in ElementTree.parse(urdf).iter("mesh"):
-        name = Path(mesh.get("filename", ""))
-        if not (name.is_absolute() or ".." in name.parts) and (urdf.parent / name).is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(urdf.parent / name, folder / name)
+def _copy_robot(robot: RobotConfig, folder: Path) -> Path:
+    """Copy a robot's URDF, and its meshes to ``meshes/``; return the path of the URDF's copy.
+
+    The copy names the copied meshes; without meshes it is the same, byte for byte.
+    """
+    urdf = read_urdf(robot)
+    names: dict[Path, str] = {}
+    for mesh in urdf.root.iter("mesh"):
+        name = mesh.get("filename", "")
+        path = Path(mesh_path(name, urdf.path))
+        if not (path.is_absolute() and path.is_file()):
+            raise ConfigError(
+                f"{urdf.path}: no mesh {name!r}; a mesh is named relative to the URDF, as "
+                "package://PACKAGE/FILE above it, or by an absolute path"
+            )
+        # Numbered, as meshes from two folders may have one name.
+        mesh.set("filename", names.setdefault(path.resolve(), f"meshes/{len(names)}_{path.name}"))
+    copied = folder / urdf.path.name
+    shutil.copyfile(urdf.path, copied)
+    if names:
+        (folder / "meshes").mkdir(exist_ok=True)
+        for path, name in names.items():
+            shutil.copyfile(path, folder / name)
+        ElementTree.ElementTree(urdf.root).write(copied, encoding="utf-8")
+    return copied
 
 
 def _write_graph(graph: LowGraph | HighGraph, path: Path) -> None:
@@ -306,7 +326,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     field.place(0, 0, make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
     start, goal = field.starts[:, 0], field.goals[:, 0]
     physics = dataclasses.replace(config.physics, control_dt=controller.dt)
-    world = World(1, controller.robot(urdf_path(config.robot)), physics, field)
+    world = World(1, controller.robot(), physics, field)
     loco = Locomotion(1, config.robot, config.physics, field, config.gyro, world=world)
     differences: list[Array] = []
     seconds: list[float] = []

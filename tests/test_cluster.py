@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -136,19 +137,42 @@ def test_no_cluster(
     assert not out.exists()
 
 
-def test_a_node_with_another_version_is_refused(
+def test_a_node_with_other_code_is_refused(
     nodes: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "tdgc").mkdir()
-    (tmp_path / "tdgc/__init__.py").write_text("__version__ = '0.0.1'\n")
+    """A changed robot, a missing module and a changed one are named; an exact copy may join."""
+    for folder in ("tdgc", "urdf"):
+        shutil.copytree(
+            Path(tdgc.__path__[0]).parent / folder,
+            tmp_path / folder,
+            ignore=shutil.ignore_patterns("__pycache__", "pretrained"),
+        )
     monkeypatch.chdir(tmp_path.parent)  # Ray's workers look in this process's folder first
     other = nodes.add_node(num_cpus=1, env_vars={"PYTHONPATH": str(tmp_path)})
-    with pytest.raises(
-        ClusterError, match=rf"^node [0-9.]+ has tdgc 0\.0\.1, this machine {tdgc.__version__}$"
-    ):
+    gaits, robot = tmp_path / "tdgc/sim/gaits.py", tmp_path / "urdf/quadruped.urdf"
+
+    def refused(files: str) -> None:
+        with pytest.raises(
+            ClusterError, match=rf"^node [0-9.]+ differs from this machine in {files}$"
+        ):
+            connect("auto")
+        assert not ray.is_initialized()
+
+    try:
+        same = robot.read_text(encoding="utf-8")
+        robot.write_text(same.replace("mass value", "mass  value", 1), encoding="utf-8")
+        refused("urdf/quadruped.urdf")
+        kept = gaits.read_text(encoding="utf-8")
+        gaits.unlink()
+        refused("tdgc/sim/gaits.py and 1 more")
+        robot.write_text(same, encoding="utf-8")
+        gaits.write_text(kept + "\n", encoding="utf-8")
+        refused("tdgc/sim/gaits.py")
+        gaits.write_text(kept, encoding="utf-8")
         connect("auto")
-    assert not ray.is_initialized()
-    nodes.remove_node(other)
+    finally:
+        ray.shutdown()
+        nodes.remove_node(other)
 
 
 # ------------------------------------------------------------------ training

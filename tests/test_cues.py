@@ -133,23 +133,29 @@ def test_lips_are_where_probes_met_them(
     np.testing.assert_allclose(found, there, atol=0.06)
 
 
-def test_leaps_are_timed_by_the_gait_clock(law: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The law undoes the warp of the cue's phases by the duty factor.
+def test_leaps_are_planned_from_the_clock_and_the_speed(
+    law: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Leaps warp the phases in the cue by 0.05 of a cycle, 2 cm of travel.
 
-    In leaps, the warp is 0.05 of a cycle or 2 cm.
+    The robots on track 1 are placed up to 23 cm further along their tiles once that is known, which
+    is no speed.
     """
     driver = HierarchyDriver(law, HighLevelConfig(commands=CONFIG.commands))
-    off, plan_steps = [], LeapPlan.steps
+    clocks, speeds, plan_steps = [], [], LeapPlan.steps
 
     def steps(plan: LeapPlan, rows: Array, motion: Motion, landing: Landing) -> tuple[Array, Array]:
-        off.extend(wrap_angle(2.0 * np.pi * (motion.clock - driver._loco.clock.clock[rows])))
+        loco = driver._loco
+        clocks.extend(wrap_angle(2.0 * np.pi * (motion.clock - loco.clock.clock[rows])))
+        speeds.extend(motion.speed - loco.world.state.lin_vel[rows, 0])
         return plan_steps(plan, rows, motion, landing)
 
     monkeypatch.setattr(LeapPlan, "steps", steps)
-    monkeypatch.setattr(evaluation, "HORIZON", 1.5)
-    run_cell(Cell("cues", "nominal", "gap", 4, 0, 2), LOW, driver, seed=11)
-    assert len(off) > 20
-    np.testing.assert_allclose(off, 0.0, atol=1e-5)
+    monkeypatch.setattr(evaluation, "HORIZON", 2.0)
+    run_cell(Cell("cues", "nominal", "gap", 6, 0, 48), LOW, driver, seed=11)
+    assert len(clocks) > 500
+    np.testing.assert_allclose(clocks, 0.0, atol=1e-5)
+    assert np.abs(speeds).max() < 0.6
 
 
 def test_the_slope_is_seen_by_the_probes_at_either_side(

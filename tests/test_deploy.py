@@ -103,7 +103,7 @@ def test_each_missing_field_is_refused_in_one_line(folder: Path, tmp_path: Path,
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, "an interface of version 2, this package reads 3; export the policies"),
+        ({"version": 3}, "an interface of version 3, this package reads 4; export the policies"),
         ({"version": None}, "an interface of version None"),
         ({"rate": {"unit": "ms", "value": 50}}, "rate.unit: 'Hz' was expected"),
         ({"rate": {"unit": "Hz", "value": 0}}, "rate.value: 0 is less than or equal to"),
@@ -293,6 +293,153 @@ def test_columns_with_gaps_or_twice_are_refused(
     with pytest.raises(LogError) as refused:
         log.read(path, controller)
     assert str(refused.value) == f"{path}: {message}"
+
+
+def test_a_csv_of_a_spreadsheet_is_read(controller: Controller, walk: Path, tmp_path: Path) -> None:
+    """Spreadsheets put a byte order mark first, and editors leave empty lines at the end."""
+    entries = columns(walk)
+    path = write_csv(tmp_path / "walk.csv", list(entries), list(entries.values()))
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes() + b"\r\n\r\n")
+    found = log.read(path, controller)
+    assert found.time == pytest.approx(0.02 * np.arange(12)) and len(found.decisions) == 3
+
+
+def test_cues_and_decisions_are_in_the_rows_with_a_decision(walk: Path) -> None:
+    table = np.load(walk)
+    for name in log.DECIDED:
+        rows = np.flatnonzero(np.isfinite(table[name]).any(axis=1))
+        assert rows.tolist() == [0, 5, 10], name
+    for name in log.GIVEN:
+        assert np.isfinite(table[name][:-1]).all() and np.isnan(table[name][-1]).all(), name
+
+
+@pytest.fixture(scope="module")
+def arrival(
+    controller: Controller, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[int]]:
+    """Log of 130 steps that reaches the goal in row 13, and the rows with a decision."""
+    robot, writer, decided = state(controller), LogWriter(controller), []
+    controller.reset()
+    for step in range(130):
+        goal = np.array([0.4 if step == 13 else 5.0, 0.0])
+        readings = controller.sense(robot, goal, "rough", level)
+        controller.step(readings)
+        writer.add(readings)
+        decided += [step] if controller.decided else []
+    writer.end(readings)
+    path = tmp_path_factory.mktemp("log") / "arrival.npz"
+    writer.save(path)
+    return path, decided
+
+
+def changed(path: Path, out: Path, **values: np.ndarray) -> Path:
+    np.savez(out / "changed.npz", **(dict(np.load(path)) | values))
+    return out / "changed.npz"
+
+
+def test_decisions_are_due_until_the_controller_stands(
+    controller: Controller, arrival: tuple[Path, list[int]], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    path, decided = arrival
+    assert decided == list(range(0, 113, 5))  # 13 steps, and 2 s at 50 Hz
+    assert log.read(path, controller).decisions.tolist() == decided
+    table = dict(np.load(path))
+    for rows, like, message in (
+        (slice(110, None), None, "a gap at 2.20 s: no decision; decisions are due every 0.1 s"),
+        (slice(50, None), None, "a gap at 1.00 s: no decision; "),
+        (slice(None), None, "has no decision"),
+        (42, 40, "a gap at 0.84 s: a decision where none is due; "),
+        (115, 40, "a gap at 2.30 s: a decision where none is due; "),
+        (130, 40, "a gap at 2.60 s: a decision where none is due; "),  # the final row
+    ):
+        told = {name: table[name].copy() for name in log.DECIDED}
+        for name, values in told.items():
+            values[rows] = np.nan if like is None else table[name][like]
+        with pytest.raises(LogError) as refused:
+            log.read(changed(path, tmp_path, **told), controller)
+        assert message in str(refused.value) and "\n" not in str(refused.value)
+    away = np.tile([5.0, 0.0], (131, 1))  # the goal is never reached, so decisions must go on
+    with pytest.raises(LogError, match=r"a gap at 2.30 s: no decision; decisions are due"):
+        log.read(changed(path, tmp_path, goal=away), controller)
+    monkeypatch.setattr(controller, "horizon", 113)
+    assert log.read(changed(path, tmp_path, goal=away), controller).decisions.tolist() == decided
+    monkeypatch.setattr(controller, "horizon", 110)
+    with pytest.raises(LogError, match=r"a gap at 2.20 s: a decision where none is due; "):
+        log.read(path, controller)
+
+
+def test_a_last_row_cannot_have_a_decision(
+    controller: Controller, walk: Path, tmp_path: Path
+) -> None:
+    """A log cut off in a row with a decision, which no step follows."""
+    short = {name: values[:11] for name, values in np.load(walk).items()}
+    with pytest.raises(LogError, match=r"a gap at 0.20 s: a decision where none is due; .* last"):
+        log.read(changed(walk, tmp_path, **short), controller)
+
+
+@pytest.mark.parametrize(("start", "told"), [(30.0, "30.00"), (1.7e9, "1700000000.00")])
+def test_the_first_row_is_the_start_of_the_episode(
+    controller: Controller, walk: Path, tmp_path: Path, start: float, told: str
+) -> None:
+    time = np.load(walk)["time"]
+    assert log.read(changed(walk, tmp_path, time=time + 0.005), controller).time[0] == 0.005
+    with pytest.raises(LogError, match=f"begins at {told} s, not at 0 s, where an episode starts"):
+        log.read(changed(walk, tmp_path, time=time + start), controller)
+
+
+def test_each_value_is_compared_with_the_graphs(
+    controller: Controller, arrival: tuple[Path, list[int]]
+) -> None:
+    found = log.read(arrival[0], controller)
+    same = dict.fromkeys(("decision", "clock", "commands", "joint_targets"), (0.0, np.inf))
+    assert log.replay(found, controller) == same
+    for name, row, change in (
+        ("decision", 20, 0.1),
+        ("clock", 21, -0.3),
+        ("commands", 22, 0.02),
+        ("commands", 120, 0.02),  # while it stands
+        ("joint_targets", 23, 0.01),
+    ):
+        before = found.values[name][row].copy()
+        found.values[name][row] += change
+        wanted = same | {name: (pytest.approx(abs(change)), pytest.approx(0.02 * row))}
+        assert log.replay(found, controller) == wanted
+        found.values[name][row] = before
+    found.values["clock"] += 2.0  # whole cycles
+    assert log.replay(found, controller)["clock"] == (pytest.approx(0.0, abs=1e-9), np.inf)
+    found.values["decision"] += 0.004  # as rounding might
+    assert log.replay(found, controller)["decision"] == (pytest.approx(0.004), np.inf)
+
+
+def test_what_differs_from_the_graphs_is_named(
+    folder: Path, walk: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(diagnose, "Controller", functools.partial(Controller, form=FORM))
+    commands = np.full((12, 15), 0.123)
+    path = changed(walk, tmp_path, commands=commands)
+    flags = ["--export", str(folder), "--outcome", "fell", "--out", str(tmp_path)]
+    assert diagnose.main([str(path), *flags]) == 1
+    said = capsys.readouterr().err
+    off = np.abs(np.load(walk)["commands"][:-1] - 0.123).max()
+    assert f"not what the graphs give: commands from 0.00 s on, by up to {off:.3f}: " in said
+    assert "joint_targets" not in said and said.count("\n") == 1
+
+
+def test_a_reached_goal_leaves_no_older_diagnosis(
+    folder: Path, walk: Path, arrival: tuple[Path, list[int]], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(diagnose, "Controller", functools.partial(Controller, form=FORM))
+    flags = ["--export", str(folder), "--out", str(tmp_path)]
+    assert diagnose.main([str(walk), *flags, "--outcome", "fell"]) == 0
+    assert (tmp_path / "diagnosis.csv").is_file()
+    assert diagnose.main([str(arrival[0]), *flags]) == 0
+    said = capsys.readouterr().out
+    assert "arrival: reached after " in said
+    assert "decision, clock, commands, joint_targets are what the graphs give, to " in said
+    assert not (tmp_path / "diagnosis.csv").exists()
 
 
 def damaged(walk: Path, out: Path, kind: str) -> Path:

@@ -162,7 +162,8 @@ def test_the_teacher_drives_as_it_teaches(low, family):
         driver.begin(task.locomotion, task.goal, family)
         for step in range(12):
             if step % 5 == 0:
-                task.teacher.watch(task.locomotion, task.step_seconds)
+                if step > 0:
+                    task.teacher.watch(task.locomotion, task.step_seconds)
                 taught = task.decoder.decode(
                     task.observe()[:, -GUIDANCE:][:, :NUM_ACTIONS].astype(float)
                 )

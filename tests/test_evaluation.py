@@ -32,7 +32,7 @@ from tdgc.benchmark.evaluation import (
 )
 from tdgc.benchmark.trace import Selection
 from tdgc.benchmark.tracking import track_gait
-from tdgc.config import CommandRanges, RandomisationConfig
+from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, RandomisationConfig
 from tdgc.parallel.worker import WorkerError
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import Locomotion
@@ -121,7 +121,14 @@ def test_physics_at_1000_hz_keeps_the_control_rate(low):
     config = load_low(low)[1]
     fast = physics_of(config, CONDITIONS["physics-1000hz"])
     assert fast.substeps == 20 and fast.dt == pytest.approx(0.001)
-    assert physics_of(config, CONDITIONS["nominal"]).dt == pytest.approx(0.0025)
+    assert physics_of(config, CONDITIONS["nominal"]) == PhysicsConfig()
+
+
+def test_physics_is_the_benchmarks_whatever_a_policy_was_trained_in() -> None:
+    easy = PhysicsConfig(control_dt=0.04, substeps=8, hold=1, friction=1.2, solver_iterations=50)
+    found = physics_of(LowLevelConfig(physics=easy), CONDITIONS["nominal"])
+    assert found == PhysicsConfig(control_dt=0.04, substeps=16)
+    assert (found.dt, found.friction, found.hold) == (0.0025, 0.8, 2)
 
 
 def test_pushes_have_their_size_and_are_paired():

@@ -5,12 +5,13 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnxruntime
+import pybullet_data
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -476,6 +477,7 @@ def test_interface_says_how_to_drive_the_joints(folder: Path) -> None:
     hip = 0.08 * np.sin(0.1)
     height = max(front, rear) * np.cos(0.1) - hip + 0.022
     assert table["start"]["trunk_height"]["value"] == pytest.approx(height, abs=1e-9)
+    assert table["frames"]["origin"] == "origin of the URDF's root link"
     assert table["robot"]["urdf"]["file"] == "quadruped.urdf"
     assert table["robot"]["total_mass"]["value"] == pytest.approx(12.6)
     assert table["robot"]["link_masses"]["value"]["trunk"] == 5.6
@@ -502,29 +504,48 @@ def test_interface_says_how_to_decide(folder: Path) -> None:
     assert task["goal_radius"] == {"unit": "m", "value": 0.5}
     assert task["horizon"]["unit"] == "s" and task["horizon"]["value"] == pytest.approx(20.0)
     assert task["after_goal"]["keep_deciding"]["value"] == pytest.approx(2.0)
-    assert task["family"]["otherwise"] == "unknown"
+    assert task["family"] == {"scope": "whole tile", "otherwise": "unknown"}
+    said = {s["name"]: s["meaning"] for s in table["inputs"]}
+    assert "of the whole tile, from start to goal" in said["family"]
+    assert all("origin of the URDF's root link" in said[name] for name in ("goal", "probes"))
+
+
+def with_meshes(path: Path, names: Sequence[str]) -> LowLevelConfig:
+    """Write the shipped robot to ``path``, with these meshes as its trunk's visual shape."""
+    text, shape = urdf_path(LOW_CONFIG.robot).read_text(), '<box size="0.3 0.15 0.1"/>'
+    assert text.count(shape) == 1
+    meshes = [f'<mesh filename="{name}"/>' for name in names]
+    path.write_text(text.replace(shape, "</geometry></visual><visual><geometry>".join(meshes)))
+    robot = dataclasses.replace(LOW_CONFIG.robot, urdf=str(path))
+    return dataclasses.replace(LOW_CONFIG, robot=robot)
 
 
 def test_the_robots_meshes_come_along(tmp_path: Path) -> None:
-    urdf = tmp_path / "robot" / "robot.urdf"
-    (urdf.parent / "meshes").mkdir(parents=True)
-    (urdf.parent / "meshes" / "trunk.stl").write_text("solid trunk")
-    (tmp_path / "secret.stl").write_text("not of the robot")
-    text = urdf_path(LOW_CONFIG.robot).read_text()
-    shape = '<geometry><box size="0.3 0.15 0.1"/></geometry>'
-    mesh = '<geometry><mesh filename="{}"/></geometry>'
-    both = [mesh.format(name) for name in ("meshes/trunk.stl", "../secret.stl")]
-    visuals = "</visual><visual>".join(both)
-    urdf.write_text(text.replace(shape, visuals))
-    pair = export.load_pair(LOW, random_high(tmp_path / "high", HIGH_CONFIG))
-    robot = dataclasses.replace(LOW_CONFIG.robot, urdf=str(urdf))
-    pair = dataclasses.replace(pair, low_config=dataclasses.replace(LOW_CONFIG, robot=robot))
-    (tmp_path / "out").mkdir()
-    export.write(pair, tmp_path / "out", [])
-    found = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")}
-    assert found == {
-        "low_interface.json", "high_interface.json", "robot.urdf", "meshes/trunk.stl"
-    }  # fmt: skip
+    """However the URDF names them, and the check needs none but the copies."""
+    package, out = tmp_path / "dog", tmp_path / "out"
+    for folder in (package / "urdf", package / "meshes", out):
+        folder.mkdir(parents=True)
+    source = Path(pybullet_data.getDataPath()) / "a1" / "meshes" / "hip.obj"
+    bare = re.sub("(?m)^(mtllib|usemtl) .*\n", "", source.read_text())
+    (package / "urdf" / "hip.obj").write_text(bare)
+    (package / "meshes" / "hip.obj").write_text(bare + "# another\n")
+    names = ["hip.obj", "../meshes/hip.obj", "package://dog/meshes/hip.obj", "hip.obj"]
+    config = with_meshes(package / "urdf" / "dog.urdf", names)
+    policies.save_copy(tmp_path / "low", LOW_POLICY, {}, {"config": to_dict(config)})
+    short = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
+    high = random_high(tmp_path / "high", short, config)
+    export.write(export.load_pair(tmp_path / "low", high), out, ["torchscript"])
+    for mesh in package.rglob("*.obj"):
+        mesh.unlink()
+    copied = re.findall('mesh filename="(.*?)"', (out / "dog.urdf").read_text())
+    own, other = "meshes/0_hip.obj", "meshes/1_hip.obj"
+    assert copied == [own, other, other, own]
+    assert (out / own).read_text() == bare and (out / other).read_text() == bare + "# another\n"
+    assert export.check(out, "torchscript", tmp_path / "low", high).difference <= TOLERANCE
+
+
+def test_a_robot_without_meshes_is_copied_as_it_is(folder: Path) -> None:
+    assert (folder / "quadruped.urdf").read_bytes() == urdf_path(LOW_CONFIG.robot).read_bytes()
 
 
 ROBOT = """
@@ -578,23 +599,24 @@ def test_command_writes_checks_and_reports(
     assert said.err.count("\n") == 1
 
 
-def test_a_robot_that_the_check_cannot_load_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [
+        ("no.stl", "robot.urdf: no mesh 'no.stl'; a mesh is named relative to the URDF, as "),
+        ("robot.urdf", "out/robot.urdf: Bullet cannot load it"),  # it is there, but no mesh
+    ],
+)
+def test_a_robot_that_cannot_be_loaded_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], mesh: str, message: str
 ) -> None:
-    """Its URDF names a missing mesh, which only a simulator tries to load."""
-    shape, mesh = '<geometry><box size="0.3 0.15 0.1"/></geometry>', '<mesh filename="no.stl"/>'
-    text = urdf_path(LOW_CONFIG.robot).read_text()
-    assert shape in text
-    (tmp_path / "robot.urdf").write_text(text.replace(shape, f"<geometry>{mesh}</geometry>"))
-    robot = dataclasses.replace(LOW_CONFIG.robot, urdf=str(tmp_path / "robot.urdf"))
-    config = dataclasses.replace(LOW_CONFIG, robot=robot)
+    config = with_meshes(tmp_path / "robot.urdf", [mesh])
     policies.save_copy(tmp_path / "low", LOW_POLICY, {}, {"config": to_dict(config)})
     high = random_high(tmp_path / "high", HIGH_CONFIG, config, hidden=4)
     flags = ["--low", str(tmp_path / "low"), "--high", str(high), "--format", "torchscript"]
     assert export.main([*flags, "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr()
     assert said.err.startswith("tdgc.export: ") and said.err.count("\n") == 1
-    assert "robot.urdf: Bullet cannot load it" in said.err
+    assert message in said.err
 
 
 def save_pairs(path: Path) -> None:

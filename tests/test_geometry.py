@@ -166,7 +166,8 @@ def test_a_foot_on_links_that_are_turned(tmp_path: Path) -> None:
     foot = '<collision><origin xyz="0 0 -0.213" rpy="0 0 0"/><geometry><sphere radius="0.022"/>'
     foot += "</geometry></collision>"
     assert foot in SHIPPED  # of the feet, and of the knees too
-    link = '<inertial><mass value="0.01"/></inertial>'
+    inertia = '<inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<inertial><mass value="0.01"/>{inertia}</inertial>'
     text = SHIPPED.replace(foot, "")
     for leg in ("FL", "FR", "RL", "RR"):
         text = text.replace(
@@ -399,11 +400,28 @@ def test_meshes_are_found_from_elsewhere(tmp_path: Path) -> None:
     assert found[3:] == ["hull.stl", "package://dog/x.stl"]
 
 
-def test_what_is_fixed_needs_an_inertia(tmp_path: Path) -> None:
-    bare = re.sub("<inertia .*?/>", "", TURNED)
-    config = changed(tmp_path, ("</robot>", bare))
-    with pytest.raises(ConfigError, match=r"changed\.urdf: link 'mast': inertial/inertia ixx must"):
+def test_rotor_inertia_is_about_the_joint_in_any_inertial_frame(tmp_path: Path) -> None:
+    """Legs whose inertial frames are turned by 90 degrees swing as before."""
+    level = '<origin xyz="0 0 -0.133125" rpy="0 0 0"/>\n      <mass value="0.2"/>'
+    turned = changed(tmp_path, (level, level.replace('rpy="0 0 0"', 'rpy="0 0 1.5707963"')))
+    swung = []
+    for config in (RobotConfig(), turned):
+        world = World(1, config, PhysicsConfig())
+        world.reset_robots([0], np.array([[0.0, 0.0, 2.0]]), UPRIGHT, nominal_pose(config)[None])
+        world.set_dynamics([0], np.array([0.8]), np.zeros(1), np.array([0.02]))
+        for _ in range(3):
+            world.step(nominal_pose(config)[None, None] + 0.3, np.zeros(1), np.zeros((1, 12)))
+        swung.append(world.state.q[0])
+        world.close()
+    np.testing.assert_allclose(swung[1], swung[0], atol=1e-5)
+
+
+def test_nominal_pose_beyond_the_joint_limits(tmp_path: Path) -> None:
+    config = changed(tmp_path, ('lower="-2.82" upper="-0.89"', 'lower="-1.2" upper="-0.89"'))
+    said = r"robot\.nominal_calf puts FL_calf_joint at -1\.5 rad; .*urdf allows -1\.2 to -0\.89$"
+    with pytest.raises(ConfigError, match=said):
         World(1, config, PhysicsConfig())
+    World(1, dataclasses.replace(config, nominal_calf=-1.0), PhysicsConfig()).close()
 
 
 def test_leg_angles_of_another_robot(robot: RobotConfig) -> None:
@@ -526,6 +544,17 @@ REFUSED = [
         r"has the joint 'imu_joint' beside the twelve of its legs",
     ),
     ("</robot>", "<link name='imu'/></robot>", r"link 'imu': belongs to no leg and is not fixed"),
+    (
+        "</robot>",
+        re.sub("<inertia .*?/>", "", TURNED),
+        r"link 'mast': inertial/inertia ixx must be a number",
+    ),
+    (
+        'iyy="0.000635"',
+        'iyy="-0.000635"',
+        r"link 'FL_hip': its principal moments of inertia must be positive and none above",
+    ),
+    ('izz="0.073013"', 'izz="0.1"', r"link 'trunk': .* not 0\.016147, 0\.068159, 0\.1$"),
     ("</robot>", "<link name='FL_hip'/></robot>", r"two of its links have one name"),
     ('<link name="RR_calf">', '<link name="RR_shin">', r".*link 'RR_calf', which is missing"),
     ("revolute", "fixed", r"joint 'FL_hip_joint': must be revolute about the axis 1 0 0"),

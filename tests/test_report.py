@@ -161,6 +161,52 @@ def test_paired_differences_and_where_dominance_fails(tmp_path: Path) -> None:
     assert ["pushes", *["-100.0 -100.0 to +12.2"] * 2] in reader.rows  # one tile proves nothing
 
 
+def test_mirrored_tiles_and_other_editions(tmp_path: Path) -> None:
+    """Of ten tiles seven are reached, of their images two, and one of Tilt both ways."""
+    way = {"goal": np.zeros(2), "track": np.zeros((2, 3))}
+    walk = {"time_s": 9.5, "path_m": 5.25, "energy_j": 500.0, "shares": (1.0, 0.0, 0.0, 0.0)}
+    episodes = [
+        Episode(
+            EVIL, condition, family, 8, k, 3, "reached" if k < reached else "fell", **walk, **way
+        )
+        for condition, family, reached, count in (
+            ("nominal", "gap", 7, 10), ("nominal", "tilt", 1, 1),
+            ("mirrored", "gap", 2, 10), ("mirrored", "tilt", 1, 1),
+        )
+        for k in range(count)
+    ]  # fmt: skip
+    summary = write_results(tmp_path, episodes, {"low": 1, "high": 2})
+    for name, _, _ in report.FIGURES:
+        write_picture(tmp_path / name)
+    reader = Reader(report.render(tmp_path))
+    assert ["policy", "gap", "tilt", "mean"] in reader.rows
+    (found,) = [row for row in reader.rows if row[0] == EVIL and "+" in row[2]]
+    low, high = (100 * summary["sides"][EVIL]["gap"][key] for key in ("ci_low", "ci_high"))
+    assert found[1] == f"-50.0 {low:+.1f} to {high:+.1f}" and high < 0.0  # but not "below" anything
+    assert found[2].startswith("+0.0 ") and found[3].startswith("-45.5 ")
+    assert "mirrored tiles - the tiles themselves, in points of success" in reader.text
+    assert (
+        "The low policy was trained on edition 1 of TDGC-Bench, these tiles are of edition 2."
+        in reader.text
+    )
+    assert "The high policy" not in reader.text and "episodes: 22; edition 2; tdgc" in reader.text
+    write_results(tmp_path, episodes[:10])
+    text = Reader(report.render(tmp_path)).text
+    assert "mirrored" not in text and "edition" not in text
+
+
+def test_only_height_maps_may_have_been_trained_on(tmp_path: Path) -> None:
+    write_table(tmp_path)
+    text = Reader(report.render(tmp_path)).text
+    assert text.endswith("starts and goals, none of which was used in training.")
+    table = tmp_path / "episodes.csv"
+    changed = table.read_text(encoding="utf-8").replace(",gap,", ",hills.npy,")
+    table.write_text(changed, encoding="utf-8")
+    assert Reader(report.render(tmp_path)).text.endswith(
+        "none of which was used in training, except height maps that a policy was trained on."
+    )
+
+
 def test_diagnosis_tuning_and_conditions(page: Path) -> None:
     reader = Reader(page.read_text(encoding="utf-8"))
     assert ["gap", "8", "4", "6", "0", f"{EVIL_CAUSE} (10)"] in reader.rows

@@ -46,7 +46,7 @@ class Memory:
         gap, pillar: (M,) whether there are trenches, or pillars: told by the cue or seen.
         unknown: (M,) whether the cue reports the family as unknown.
         slope: (M,) rad, slope of the ground across the heading; positive if it rises to the left.
-        x: (M,) m, position along the tile at the previous decision.
+        x: (2, M) m, position along the tile on both tracks at the previous decision.
         plan: the plan of landings.
         planned: the lips (k, 2) m that each robot's plan was made for.
         command: (M, 15) commands of the last decision.
@@ -64,7 +64,7 @@ class Memory:
         self.pillar = np.array([name == "pillar" for name in told])
         self.unknown = np.array([name == "unknown" for name in told])
         self.slope = np.zeros(m)
-        self.x = self.where.position[0, :, 0]
+        self.x = self.where.position[..., 0]
         self.plan = LeapPlan(m, low.commands, _CLEAR)
         self.planned = [np.full((1, 2), np.nan)] * m
         self.command = np.tile(default_command(), (m, 1))
@@ -164,10 +164,11 @@ class CuesLaw:
         track = memory.profile.track()
         tracks = np.maximum(track, 0).tolist()
         chosen = tracks, np.arange(len(tracks))
-        heading, x = memory.where.heading[chosen], memory.where.position[chosen][:, 0]
+        along = memory.where.position[..., 0]
+        speed, memory.x = ((along - memory.x) / self._dt)[chosen], along
+        heading, x = memory.where.heading[chosen], along[chosen]
         # Use the mean heading of the two tracks until they can be told apart.
         heading = np.where(track < 0, memory.where.heading.mean(axis=0), heading)
-        speed, memory.x = (x - memory.x) / self._dt, x
         leaping = []
         for i in np.flatnonzero(memory.gap).tolist():
             lips = memory.profile.trenches(i, tracks[i], _WIDEST)

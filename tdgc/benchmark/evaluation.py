@@ -169,13 +169,17 @@ class Episode(EpisodeRecord):
 
 
 def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
-    """Return the low policy's physics, at the condition's physics rate if it sets one."""
-    physics = config.physics
-    if condition.physics_hz is not None:
-        substeps = round(physics.control_dt * condition.physics_hz)
-        # Torque is updated at each physics step, as by a motor driver at that rate.
-        physics = dataclasses.replace(physics, substeps=substeps, hold=1)
-    return physics
+    """Return the benchmark's physics at the low policy's control rate.
+
+    It is the same for every policy, whatever physics that was trained in.
+    """
+    physics, control_dt = PhysicsConfig(), config.physics.control_dt
+    if condition.physics_hz is None:
+        substeps = round(control_dt / physics.dt)
+        return dataclasses.replace(physics, control_dt=control_dt, substeps=substeps)
+    substeps = round(control_dt * condition.physics_hz)
+    # Torque is updated at each physics step, as by a motor driver at that rate.
+    return dataclasses.replace(physics, control_dt=control_dt, substeps=substeps, hold=1)
 
 
 def tile_of(seed: int, family: str, level: int, episode: int, condition: str = "nominal") -> Tile:
@@ -262,8 +266,10 @@ class Batch:
             self.sensors = Noise(condition.noise, episode_draws(cell, seed, _SENSORS))
             self.probes = Noise(condition.noise, episode_draws(cell, seed, _PROBES))
             clock = episode_draws(cell, seed, _CLOCK).uniform(0.0, 1.0, (cell.count,))
-        physics = physics_of(config, condition)
-        world = make_world(self.field) if make_world is not None else None
+        if make_world is None:
+            world, physics = None, physics_of(config, condition)
+        else:
+            world, physics = make_world(self.field), config.physics
         loco = Locomotion(cell.count, config.robot, physics, self.field, config.gyro, world=world)
         self.loco, self.origin = loco, self.field.origin(rows, 0)
         loco.friction[:] = physics.friction if condition.friction is None else condition.friction

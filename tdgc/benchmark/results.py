@@ -136,7 +136,7 @@ def policies_of(summary: dict[str, Any]) -> dict[str, Any]:
 
 
 def verdict(pair: str, found: dict[str, float]) -> str:
-    """Return e.g. "below gp" if a pair's ``difference`` breaks the rule of dominance, else ""."""
+    """Return e.g. "below gp" if the first of a pair is significantly worse, else ""."""
     return f"below {pair.rpartition(' ')[-1]}" if found["ci_high"] < 0.0 else ""
 
 

@@ -367,10 +367,11 @@ class HighGraph(nn.Module):
         self.seconds, self.step = _constant(seconds), _constant(step)
         self.ahead = _constant([1.0, 0.0])
         start = tuple(default_command().tolist())
-        family = "1 for the terrain under the robot, 0 for the others"
+        family = "1 for the terrain of the whole tile, from start to goal; 0 for the others"
         probes = (
             "ground at points of the frame that turns by yaw alone, above a plane "
-            f"{low.robot.base_height:g} m under the trunk; clipped at {PROBE_RANGE:g} m"
+            f"{low.robot.base_height:g} m under the origin of the URDF's root link; clipped at "
+            f"{PROBE_RANGE:g} m"
         )
         cues = {
             "family": Signal("family", len(SEMANTIC), "1", family, "families"),
@@ -387,7 +388,13 @@ class HighGraph(nn.Module):
             ),
         }
         self.inputs = [
-            Signal("goal", 2, "m", "ahead and to the left in the frame that turns by yaw alone"),
+            Signal(
+                "goal",
+                2,
+                "m",
+                "ahead of and to the left of the origin of the URDF's root link, in the frame that "
+                "turns by yaw alone",
+            ),
             Signal("time_left", 1, "s", f"of {seconds:g} s"),
             *_BODY,
             Signal("last_decision", NUM_ACTIONS, "1", "the last", "decision", "decision", 0.0),

@@ -13,7 +13,7 @@ from tdgc.config import read_json
 from tdgc.errors import InputError
 
 #: Version of the interface files; any change to their contents gets a new one.
-VERSION = 3
+VERSION = 4
 SCHEMA = Path(__file__).with_name("interface.schema.json")
 
 Table = dict[str, Any]

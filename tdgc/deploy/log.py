@@ -41,7 +41,7 @@ DECIDED = ("family", "probes", "probe_age", "decision")
 #: heading from the gyro alone drifts.
 OPTIONAL = {"gyro": 3, "yaw": 1}
 ENDS = ("reached", "fell", "collided", "timeout")  # of an episode without a tile
-_SAME = 1e-3  # rad: targets written with four digits differ by less
+_SAME = 5e-3  # in the value's own unit: logs with four decimals differ by up to 3e-3, in leaps
 
 
 class LogError(InputError):
@@ -87,18 +87,17 @@ class LogWriter:
     def add(self, readings: dict[str, Array]) -> None:
         """Record the step that the controller has just taken on ``readings``."""
         low, high = self._controller.low.values, self._controller.high.values
-        row = readings | {name: low[name] for name in GIVEN}
+        made = {name: low[name] for name in GIVEN}
         if self._controller.decided:
-            row["decision"] = high["decision"]
-        else:
-            row = {name: value for name, value in row.items() if name not in DECIDED}
-        self._note(row, self._controller.count - 1)
+            made |= {name: high[name] for name in DECIDED if name in high}
+        self._note(readings, made, self._controller.count - 1)
 
     def end(self, readings: dict[str, Array]) -> None:
         """Record the ``readings`` after the last step."""
-        self._note(readings, self._controller.count)
+        self._note(readings, {}, self._controller.count)
 
-    def _note(self, row: dict[str, Array], step: int) -> None:
+    def _note(self, readings: dict[str, Array], made: dict[str, Array], step: int) -> None:
+        row = {name: value for name, value in readings.items() if name not in DECIDED} | made
         # Copies, because a simulator may reuse its arrays.
         whole = {n: np.array(row.get(n, [np.nan] * k)) for n, k in self._layout.items()}
         self._rows.append(whole | {"time": np.array(step * self._controller.dt)})
@@ -120,8 +119,8 @@ def read(path: Path, controller: Controller) -> Log:
     """Read the log of a robot that ran the controller's folder.
 
     Raises:
-        LogError: the file is missing or damaged, lacks values or rows, or has values that are not
-            numbers.
+        LogError: the file is missing or damaged, lacks values or rows, has values that are not
+            numbers, does not begin at 0 s, or has decisions where none are due.
     """
     known = {"time", *layout(controller)}
     try:
@@ -159,13 +158,13 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
 def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
     """Read the ``known`` values by name, entries in the order of their column numbers.
 
-    An empty cell is NaN.
+    An empty cell is NaN; empty lines are skipped.
 
     Raises:
         LogError: a column is duplicated, or a column number is skipped.
     """
-    with open(path, newline="", encoding="utf-8") as file:
-        header, *lines = csv.reader(file)
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        header, *lines = filter(None, csv.reader(file))
     cells = np.array([[float(cell or "nan") for cell in line] for line in lines])
     cells = cells.reshape(len(lines), len(header))
     places: dict[str, dict[int, int]] = {}
@@ -190,18 +189,16 @@ def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
 
 def _gap(log: Log, controller: Controller) -> str | None:
     """Describe a gap in a log; None if there is none."""
-    time, dt, every = log.time, controller.dt, controller.decimation
+    time, dt = log.time, controller.dt
     if len(time) < 2 or not np.isfinite(time).all():
         return "needs two rows at least, each with its time"
+    if abs(time[0]) > 0.5 * dt:
+        return f"begins at {time[0]:.2f} s, not at 0 s, where an episode starts"
     for k in np.flatnonzero(np.abs(np.diff(time) - dt) > 0.5 * dt):
         step = time[k + 1] - time[k]
         return (
             f"a gap at {time[k]:.2f} s, where the next row is {step:.3f} s later and not {dt:g} s"
         )
-    due = np.arange(0, max(log.decisions, default=0) + 1, every)
-    for k in np.setxor1d(due, log.decisions):
-        wrong = "no decision" if k in due else "a decision between those"
-        return f"a gap at {time[k]:.2f} s: {wrong} that are due every {every * dt:g} s"
     steps = np.arange(len(time))
     for names, rows in (
         ((*SENSED, *OPTIONAL), steps),
@@ -212,25 +209,54 @@ def _gap(log: Log, controller: Controller) -> str | None:
             empty = rows[~np.isfinite(log.values[name][rows]).all(axis=1)]
             if empty.size:
                 return f"a gap at {time[empty[0]]:.2f} s: no {name}"
+    if not log.decisions.size:
+        return "has no decision"
+    task, due = controller.high.table["task"], _due(log, controller)
+    for k in np.setxor1d(due, log.decisions):
+        wrong = "no decision" if k in due else "a decision where none is due"
+        return (
+            f"a gap at {time[k]:.2f} s: {wrong}; decisions are due every "
+            f"{controller.decimation * dt:g} s before the last row, until "
+            f"{task['after_goal']['keep_deciding']['value']:g} s after the goal is reached, for "
+            f"{task['horizon']['value']:g} s at most"
+        )
     return None
 
 
-def replay(log: Log, controller: Controller) -> tuple[float, float]:
-    """Replay the readings of a log through the graphs.
+def _due(log: Log, controller: Controller) -> NDArray[np.intp]:
+    """Rows in which ``high`` decides, by the rule of ``Controller.step``."""
+    task = controller.high.table["task"]
+    near = np.linalg.norm(log.values["goal"], axis=1) < task["goal_radius"]["value"]
+    reached = near.argmax() if near.any() else len(near)
+    due = np.arange(0, min(len(log.time) - 1, controller.horizon), controller.decimation)
+    since = (due - reached) * controller.dt
+    return due[since < task["after_goal"]["keep_deciding"]["value"]]
+
+
+def replay(log: Log, controller: Controller) -> dict[str, tuple[float, float]]:
+    """Replay the readings of a log through the graphs, beginning with the clock of its first row.
 
     Returns:
-        The largest difference in rad between the joint targets in the log and those of the graphs,
-        and the time in s at which a difference first exceeds rounding, infinite if none does. From
-        that time on, a value was not passed from step to step as the interface specifies, or the
-        robot ran other graphs.
+        For ``decision`` and each value in ``GIVEN``, by name: the largest difference between the
+        log and the graphs, in the value's own unit, and the time in s at which a difference first
+        exceeds rounding, infinite if none does. From that time on, a value was not passed from step
+        to step as the interface specifies, the log holds another value than was used, or the robot
+        ran other graphs.
     """
     controller.reset(float(log.values["clock"][0, 0]))
-    largest, first = 0.0, np.inf
+    found = dict.fromkeys(("decision", *GIVEN), (0.0, np.inf))
     for k, time in enumerate(log.time[:-1]):
-        readings = {name: values[k] for name, values in log.values.items() if name not in GIVEN}
-        off = float(np.abs(controller.step(readings) - log.values["joint_targets"][k]).max())
-        largest, first = max(largest, off), min(first, time if off > _SAME else np.inf)
-    return largest, first
+        controller.step({name: x[k] for name, x in log.values.items() if name not in GIVEN})
+        made = {name: controller.low.values[name] for name in GIVEN}
+        if controller.decided:
+            made["decision"] = controller.high.values["decision"]
+        for name, value in made.items():
+            off = value - log.values[name][k]
+            if name == "clock":
+                off -= np.round(off)  # whole cycles do not count
+            largest, first = max(found[name][0], float(np.abs(off).max())), found[name][1]
+            found[name] = largest, float(min(first, time if largest > _SAME else np.inf))
+    return found
 
 
 # ---------------------------------------------------------------------------- trace

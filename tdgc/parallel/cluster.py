@@ -6,6 +6,7 @@ and it is only imported when a cluster is requested.
 """
 
 import copy
+import hashlib
 import itertools
 import logging
 import os
@@ -15,12 +16,12 @@ import socket
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc import __version__
 from tdgc.errors import InputError, require
 from tdgc.parallel.worker import BLAS_THREADS, Beginning, MakeTask, Worker, WorkerError, keep_memory
 from tdgc.state import State, copies
@@ -111,23 +112,29 @@ def _join(address: str) -> None:
 
 
 def _check_nodes() -> None:
-    """Check that every node has the same version of this package.
+    """Check that every node has the same code of this package and the same ``urdf/`` beside it.
 
     Raises:
-        ClusterError: a node has another version, lacks the package, or does not answer.
+        ClusterError: a node has other files, lacks the package, or does not answer.
     """
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    def version() -> str:  # nested, hence pickled by value, for nodes without the package
+    def sums() -> dict[str, str]:  # nested, hence pickled by value, for nodes without this function
         import tdgc
 
-        return tdgc.__version__
+        root = Path(tdgc.__file__).resolve().parents[1]
+        return {
+            path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for pattern in ("tdgc/**/*.py", "urdf/**/*.urdf")
+            for path in root.glob(pattern)
+        }
 
+    here = sums()
     for name, answer in [
         (
             node["NodeManagerAddress"],
-            ray.remote(version)
+            ray.remote(sums)
             .options(
                 num_cpus=0,
                 max_retries=0,
@@ -144,8 +151,10 @@ def _check_nodes() -> None:
             raise ClusterError(f"tdgc is not installed on node {name}") from None
         except ray.exceptions.RayError as error:
             raise ClusterError(f"node {name} gives no answer ({type(error).__name__})") from error
-        if found != __version__:
-            raise ClusterError(f"node {name} has tdgc {found}, this machine {__version__}")
+        if found != here:
+            other, *more = sorted({path for path, _ in found.items() ^ here.items()})
+            rest = f" and {len(more)} more" if more else ""
+            raise ClusterError(f"node {name} differs from this machine in {other}{rest}")
 
 
 # ---------------------------------------------------------------------------- workers

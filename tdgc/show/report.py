@@ -20,9 +20,9 @@ import jinja2
 import tdgc
 from tdgc.benchmark.diagnosis import LAYERS, count_failures
 from tdgc.benchmark.evaluation import CONDITIONS, EpisodeRecord
-from tdgc.benchmark.results import PAIRED, policies_of, verdict
+from tdgc.benchmark.results import EDITIONS, PAIRED, SIDES, policies_of, verdict
 from tdgc.files import atomic
-from tdgc.sim.terrain import file_label
+from tdgc.sim.terrain import file_label, is_map
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
 NAME = "report.html"
@@ -128,6 +128,21 @@ def _conditions(episodes: Sequence[Row]) -> list[dict[str, Any]]:
     return result
 
 
+def _differences(written: dict[str, Any]) -> list[dict[str, Any]]:
+    """Collect the tables of differences in summary.json: pairs of policies, and mirrored tiles."""
+    tables = [
+        {"title": f"{pair} on the same tiles", "of": "condition", "rows": rows, "pair": pair}
+        for pair, rows in written.get(PAIRED, {}).items()
+    ]
+    if SIDES in written:
+        title = "mirrored tiles - the tiles themselves"
+        tables.append({"title": title, "of": "policy", "rows": written[SIDES], "pair": None})
+    for table in tables:
+        names = dict.fromkeys(name for found in table["rows"].values() for name in found)
+        table["families"] = sorted(names, key=lambda name: name == "mean")
+    return tables
+
+
 def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Flatten a tuning into keys as in ``--set``, with their values."""
     for key, value in tree.items():
@@ -215,8 +230,6 @@ def render(folder: Path) -> str:
         ValueError: a file has content that an evaluation does not write.
     """
     written, episodes = _json(folder / "summary.json"), _rows(folder / "episodes.csv")
-    summary, paired = policies_of(written), written.get(PAIRED, {})
-    names = [family for pair in paired.values() for found in pair.values() for family in found]
     has_diagnoses = (folder / "diagnosis.csv").is_file()
     diagnoses = _rows(folder / "diagnosis.csv") if has_diagnoses else []
     films = folder / "films"
@@ -233,11 +246,12 @@ def render(folder: Path) -> str:
         policies=_distinct(episodes, "policy"),
         seeds=_distinct(episodes, "seed"),
         count=len(episodes),
-        summary=summary,
-        paired=paired,
-        paired_families=sorted(dict.fromkeys(names), key=lambda name: name == "mean"),
+        editions=written.get(EDITIONS, {}),
+        summary=policies_of(written),
+        differences=_differences(written),
         verdict=verdict,
         conditions=_conditions(episodes),
+        maps=any(is_map(family) for family in _distinct(episodes, "family")),
         outcomes=OUTCOMES,
         figures=[(data_uri(folder / name), title, alt) for name, title, alt in FIGURES],
         layers=LAYERS,

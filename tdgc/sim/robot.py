@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.config import RobotConfig
+from tdgc.config import ConfigError, RobotConfig
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import swing_profile
 from tdgc.sim.geometry import FRONT, SIDE, Geometry, read_geometry
@@ -35,6 +35,22 @@ def nominal_height(config: RobotConfig, geometry: Geometry) -> float:
     """Height of the trunk above the soles in the nominal pose, m."""
     feet, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
     return float(geometry.foot_radius - feet[0, :, 2].min())
+
+
+def check_nominal_pose(config: RobotConfig, geometry: Geometry) -> None:
+    """Check that the robot's joints can take the nominal pose.
+
+    Raises:
+        ConfigError: an angle outside its joint's limits; the message names the setting and both.
+    """
+    for name, angle, (low, high) in zip(
+        JOINTS, nominal_pose(config).tolist(), geometry.joint_limits.tolist(), strict=True
+    ):
+        if not low <= angle <= high:
+            raise ConfigError(
+                f"robot.nominal_{name.split('_')[1]} puts {name} at {angle:g} rad; "
+                f"{config.urdf} allows {low:g} to {high:g}"
+            )
 
 
 def fitted(config: RobotConfig) -> dict[str, Any]:

@@ -101,7 +101,10 @@ def read_urdf(config: RobotConfig) -> Urdf:
         except UnicodeDecodeError as error:
             raise ConfigError("not UTF-8 text") from error
         joints, fixed = _joints(root)
-        return Urdf(path, root, joints, _parts(root, joints, fixed))
+        parts = _parts(root, joints, fixed)
+        for own in parts.values():
+            _check_inertia(own)
+        return Urdf(path, root, joints, parts)
 
 
 @contextlib.contextmanager
@@ -121,14 +124,13 @@ def merged_file(config: RobotConfig) -> Iterator[Path]:
     """URDF of the same robot with fixed links merged: a temporary file, or its own if it has none.
 
     Raises:
-        ConfigError: see ``read_urdf``; also a link without an inertia.
+        ConfigError: see ``read_urdf``.
     """
     urdf = read_urdf(config)
     if all(len(parts) == 1 for parts in urdf.parts.values()):
         yield urdf.path
         return
-    with named(urdf.path):
-        text = ElementTree.tostring(merged(urdf), encoding="unicode")
+    text = ElementTree.tostring(merged(urdf), encoding="unicode")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / urdf.path.name  # same name, for Bullet's messages
         path.write_text(text, encoding="utf-8")
@@ -137,11 +139,7 @@ def merged_file(config: RobotConfig) -> Iterator[Path]:
 
 def merged(urdf: Urdf) -> Element:
     """The robot with the mass, inertia and shapes of fixed links moved to the links that carry
-    them, and meshes named by absolute paths.
-
-    Raises:
-        ConfigError: a link without an inertia; the message names it.
-    """
+    them, and meshes named by absolute paths."""
     robot = copy.deepcopy(urdf.root)
     links = {link.get("name", ""): link for link in robot.findall("link")}
     for name, parts in urdf.parts.items():
@@ -158,7 +156,7 @@ def merged(urdf: Urdf) -> Element:
         if joint.get("name") not in JOINTS:
             robot.remove(joint)
     for mesh in robot.iter("mesh"):
-        mesh.set("filename", _found(mesh.get("filename", ""), urdf.path))
+        mesh.set("filename", mesh_path(mesh.get("filename", ""), urdf.path))
     return robot
 
 
@@ -186,6 +184,17 @@ def _together(bodies: list[tuple[float, Array, Array]]) -> tuple[float, Array, A
     return total, centre, inertia
 
 
+def _check_inertia(parts: list[Part]) -> None:
+    """Refuse a link whose inertia no body has; Bullet would set it to zero."""
+    *_, inertia = _together([_inertia(part) for part in parts])
+    least, middle, greatest = np.linalg.eigvalsh(inertia)
+    if not 0.0 < least <= middle <= greatest <= least + middle:
+        raise ConfigError(
+            f"{called(parts[0].link)}: its principal moments of inertia must be positive and none "
+            f"above the sum of the others, not {least:g}, {middle:g}, {greatest:g}"
+        )
+
+
 def _weigh(link: Element, total: float, centre: Array, inertia: Array) -> None:
     """Set the mass, centre of mass and inertia of a link."""
     inertial = link.find("inertial")
@@ -206,7 +215,7 @@ def _move(shape: Element, place: Array, rotation: Array) -> None:
     origin.set("rpy", _text(_roll_pitch_yaw(rotation)))
 
 
-def _found(name: str, urdf: Path) -> str:
+def mesh_path(name: str, urdf: Path) -> str:
     """Absolute path of a mesh that a URDF names relative to itself or to its package.
 
     If there is no such file, ``name`` stays as it is, and Bullet reports it.

@@ -25,6 +25,7 @@ from tdgc.sim.robot import (
     NUM_JOINTS,
     Array,
     RobotState,
+    check_nominal_pose,
     pd_torque,
     quaternion_product,
     rotation_matrix,
@@ -119,6 +120,7 @@ class World:
         self.joint_friction = np.zeros((num_robots, 1))
         self.bullet_seconds = 0.0
         self.state = RobotState.zeros(read_geometry(robot), num_robots)
+        check_nominal_pose(robot, self.state.geometry)
         self._clients: list[_Client] = []
         self._bodies: list[int] = []
         self._client_of: list[_Client] = []
@@ -334,12 +336,10 @@ class World:
 
     def _inertia_about_joint(self, joint: int) -> tuple[list[float], int]:
         """Principal inertia of a joint's link, (3,) kg m^2, and the index of the principal axis
-        closest to the joint's."""
+        closest to the joint's, which Bullet gives in the principal axes' frame."""
         client, body = self._client_of[0], self._bodies[0]
-        inertia, _, turned = client.getDynamicsInfo(body, joint)[2:5]
-        axis = np.array(client.getJointInfo(body, joint)[13])
-        along = rotation_matrix(np.array([turned]))[0].T @ axis
-        return list(inertia), int(np.abs(along).argmax())
+        inertia, axis = client.getDynamicsInfo(body, joint)[2], client.getJointInfo(body, joint)[13]
+        return list(inertia), int(np.abs(axis).argmax())
 
     def set_dynamics(
         self, index: ArrayLike, friction: Array, payload: Array, armature: Array
