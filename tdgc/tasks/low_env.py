@@ -112,7 +112,6 @@ class LowLevelTask:
 
     def reset(self, index: NDArray[np.integer]) -> None:
         """Start new episodes for the robots ``index`` (n,)."""
-        self.stats.add("episodes", len(index))
         self.episodes.reset(index)
         xy, yaw = self._draw_places(index)
         if self.training:
