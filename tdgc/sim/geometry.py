@@ -157,9 +157,7 @@ def _foot(parts: list[Part]) -> Array:
     """Height of the foot in the calf's frame and its radius, (2,) m."""
     calf = parts[0].link
     shapes = [
-        (part.place + part.rotation @ numbers(shape, "origin", "xyz", "0 0 0"), shape)
-        for part in parts
-        for shape in part.link.findall("collision")
+        (part.at(shape)[0], shape) for part in parts for shape in part.link.findall("collision")
     ]
     (x, y, z), foot = min(shapes, key=lambda shape: shape[0][2], default=(np.zeros(3), calf))
     if foot.find("geometry/sphere") is None:

@@ -163,14 +163,14 @@ def merged(urdf: Urdf) -> Element:
 def _inertia(part: Part) -> tuple[float, Array, Array]:
     """Mass in kg, centre of mass (3,) m and inertia about it (3, 3) kg m^2, in the frame of the
     carrying link."""
-    link = part.link
+    link, weight = part.link, mass(part.link)
+    inertial = link.find("inertial")
+    assert inertial is not None  # as it has a mass
     xx, xy, xz, yy, yz, zz = (
         float(numbers(link, "inertial/inertia", key, "", 1)[0]) for key in _INERTIA
     )
-    inertial = link.find("inertial")
-    assert inertial is not None  # as its mass was checked
     centre, turn = part.at(inertial)
-    return mass(link), centre, turn @ [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]] @ turn.T
+    return weight, centre, turn @ [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]] @ turn.T
 
 
 def _together(bodies: list[tuple[float, Array, Array]]) -> tuple[float, Array, Array]:
@@ -297,8 +297,6 @@ def _parts(
             f"link {reprlib.repr(next(iter(links)))}: belongs to no leg and is not fixed to the "
             "trunk; the trunk, which has the hips, must be the root"
         )
-    for part in (part for mine in placed.values() for part in mine):
-        mass(part.link)
     return placed
 
 
