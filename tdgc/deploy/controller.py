@@ -276,18 +276,22 @@ class Controller:
             "probe_age": np.zeros(1),
         }
 
+    def over(self, step: int, reached_at: int | None) -> bool:
+        """Whether ``high`` has stopped by ``step``: at the horizon, or ``keep_deciding`` seconds
+        after step ``reached_at``, in which the goal was reached, if it was."""
+        since = 0.0 if reached_at is None else (step - reached_at) * self.dt
+        keep: float = self._task["after_goal"]["keep_deciding"]["value"]
+        return step >= self.horizon or since >= keep
+
     def step(self, readings: dict[str, Array]) -> Array:
         """Run one control step: readings by name, as from ``sense`` -> joint targets, (12,) rad.
 
-        ``high`` stops running ``keep_deciding`` seconds after the goal is reached, or at the
-        horizon. From then on ``low`` gets the interface's commands ``stand``.
+        Once ``high`` has stopped (``over``), ``low`` gets the interface's commands ``stand``.
         """
-        task, elapsed, since = self._task, self.count * self.dt, 0.0
+        task, elapsed = self._task, self.count * self.dt
         if np.linalg.norm(readings["goal"]) < task["goal_radius"]["value"]:
             self._reached_at = self.count if self._reached_at is None else self._reached_at
-        if self._reached_at is not None:
-            since = (self.count - self._reached_at) * self.dt
-        over = self.count >= self.horizon or since >= task["after_goal"]["keep_deciding"]["value"]
+        over = self.over(self.count, self._reached_at)
         readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
         self.decided, self.seconds = False, 0.0
         for name, every in self._order:

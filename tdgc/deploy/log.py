@@ -224,13 +224,12 @@ def _gap(log: Log, controller: Controller) -> str | None:
 
 
 def _due(log: Log, controller: Controller) -> NDArray[np.intp]:
-    """Rows in which ``high`` decides, by the rule of ``Controller.step``."""
-    task = controller.high.table["task"]
-    near = np.linalg.norm(log.values["goal"], axis=1) < task["goal_radius"]["value"]
-    reached = near.argmax() if near.any() else len(near)
-    due = np.arange(0, min(len(log.time) - 1, controller.horizon), controller.decimation)
-    since = (due - reached) * controller.dt
-    return due[since < task["after_goal"]["keep_deciding"]["value"]]
+    """Rows in which ``high`` decides."""
+    radius = controller.high.table["task"]["goal_radius"]["value"]
+    near = np.linalg.norm(log.values["goal"], axis=1) < radius
+    reached_at = int(near.argmax()) if near.any() else None
+    rows = range(0, len(log.time) - 1, controller.decimation)
+    return np.array([k for k in rows if not controller.over(k, reached_at)], dtype=np.intp)
 
 
 def replay(log: Log, controller: Controller) -> dict[str, tuple[float, float]]:
