@@ -50,6 +50,7 @@ from tdgc.tasks.tiles import check_families, check_levels
 # Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
 # the apprentice alone drives, so that it learns in the states to which its own actions lead.
 _LED = 0.75
+_TRENCHED = {"gap", "ditches", "mixed"}  # families with trenches, over which the teacher leaps
 #: Where train_low.py writes its policy by default.
 TRAINED_LOW = Path("runs/low/policy")
 
@@ -63,7 +64,9 @@ def find_low() -> str:
     if TRAINED_LOW.with_suffix(".json").exists():
         if "calibration" in policies.load(TRAINED_LOW).meta:
             return str(TRAINED_LOW)
-        tqdm.write(f"{TRAINED_LOW} is not calibrated yet, its run has not come to its end")
+        tqdm.write(
+            f"{TRAINED_LOW} is not final, its run has not come to its end; --low takes it anyway"
+        )
     return str(PRETRAINED / "low")
 
 
@@ -114,7 +117,7 @@ def make_env(
 ) -> TaskVecEnv:
     """Start the workers; ``taught`` and ``led`` as in ``NavigationTask``."""
     env_config, landing = config.env, None
-    if taught and "gap" in env_config.families:
+    if taught and not _TRENCHED.isdisjoint(env_config.families):
         landing = measure_landing(*load_low(low))
         if landing is None:
             tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
@@ -178,9 +181,12 @@ def build_imitation(
     """Build the apprentice, and workers with a teacher."""
     imitation = config.imitation
     mdp = dataclasses.replace(
-        config.env, curriculum=imitation.curriculum, first_levels=config.env.levels
+        config.env, curriculum=imitation.curriculum, first_level=0, first_levels=config.env.levels
     )
-    shown, led = dataclasses.replace(config, env=mdp), _LED * (imitation.steps // config.n_envs)
+    shown, led = (
+        dataclasses.replace(config, env=mdp),
+        _LED * (min(imitation.steps, config.steps) // config.n_envs),
+    )
     env = make_env(shown, low, True, led, timeout, link)
     model = make_learner(
         Apprentice, ApprenticePolicy, env, config, device,
@@ -248,6 +254,20 @@ def check(config: HighTrainConfig) -> None:
             f"'env.first_level' and 'env.first_levels' must leave robots on the {env.levels} "
             f"levels, not on {env.first_levels} from {env.first_level} up"
         )
+    if config.imitation.steps and (env.first_level, env.first_levels) != (0, 1):
+        raise ConfigError(
+            "'env.first_level' and 'env.first_levels' have no effect with imitation, which begins "
+            "on all levels; set imitation.steps to 0, or leave them"
+        )
+    parts = {"ppo": ppo.minibatches}
+    if config.imitation.steps:
+        parts["imitation"] = config.imitation.minibatches
+    for name, minibatches in parts.items():
+        if minibatches > config.n_envs:  # each holds whole rollouts of some robots
+            raise ConfigError(
+                f"'{name}.minibatches' must be at most the {config.n_envs} robots, "
+                f"not {minibatches}"
+            )
     if not ppo.ent_coef:  # SB3 multiplies both terms by it
         for name, used in (("gait_ent_coef", True), ("imitation_coef", config.imitation.steps)):
             if used and getattr(ppo, name):

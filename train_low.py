@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch as th
@@ -19,7 +19,7 @@ from stable_baselines3 import PPO
 from tqdm import tqdm
 
 from tdgc import __version__, policies
-from tdgc.calibration import calibrate
+from tdgc.calibration import LEAST_ROBOTS, calibrate
 from tdgc.config import (
     ConfigError,
     LowLevelConfig,
@@ -31,6 +31,7 @@ from tdgc.config import (
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.ppo import NoiseScaledRate, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
+from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy
@@ -65,6 +66,41 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
     return [Phase("learning to walk", make, config.steps)]
 
 
+def leaves(key: str, value: str) -> Iterator[str]:
+    """Yield the dotted keys that ``--set key=value`` assigns; the value may be a JSON table."""
+    try:
+        table = json.loads(value)
+    except ValueError:
+        table = None
+    if isinstance(table, dict):
+        for name, own in table.items():
+            yield from leaves(f"{key}.{name}", json.dumps(own))
+    else:
+        yield key
+
+
+def check(config: LowTrainConfig) -> None:
+    """Refuse settings that would fail later or have no effect.
+
+    Raises:
+        ValueError: names the setting and what is allowed.
+    """
+    if config.env.terrain != LowLevelConfig.terrain:
+        raise ConfigError("'env.terrain' has no effect: robots train on both, see plane_share")
+    if config.ppo.batch_size < 2:
+        raise ConfigError(f"'ppo.batch_size' must be at least 2, not {config.ppo.batch_size}")
+    if 0 < config.calibration.robots < LEAST_ROBOTS:
+        raise ConfigError(
+            f"'calibration.robots' must be 0 or at least {LEAST_ROBOTS}, "
+            f"not {config.calibration.robots}"
+        )
+    check_families(config.env.families)
+    check_levels(config.env.levels)
+    check_robot(config.env.robot, config.env.physics)
+    trunk = read_geometry(config.env.robot).trunk_mass
+    check_randomisation(config.env.randomisation, config.env.physics, trunk)
+
+
 def fit(config: LowTrainConfig, assignments: Sequence[str]) -> LowTrainConfig:
     """Adapt the configuration to another robot's URDF; assigned settings are kept.
 
@@ -73,7 +109,10 @@ def fit(config: LowTrainConfig, assignments: Sequence[str]) -> LowTrainConfig:
     """
     if config.env.robot.urdf == RobotConfig().urdf:
         return config
-    assigned = {text.partition("=")[0].strip() for text in assignments}
+    assigned: set[str] = set()
+    for text in assignments:
+        key, _, value = text.partition("=")
+        assigned |= set(leaves(key.strip(), value))
     found = [
         f"env.robot.{name}={json.dumps(value)}"
         for name, value in fitted(config.env.robot).items()
@@ -91,13 +130,18 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
     """Run the last phase: replace the trained policy by its calibrated copy.
 
     The trained policy is kept as ``uncalibrated``. An interrupted calibration starts over when the
-    run is resumed, with the same result.
+    run is resumed, with the same result. Without calibration the policy is only marked as final.
 
     Raises:
         WorkerError: a worker failed.
     """
     learned = policies.load(out / "policy")
-    if not config.calibration.robots or "calibration" in learned.meta:
+    robots, done = config.calibration.robots, learned.meta.pop("calibration", None)
+    if done is not None and (done["robots"] or not robots):
+        return
+    if not robots:
+        meta = {**learned.meta, "calibration": {"robots": 0}}
+        policies.save_copy(out / "policy", learned, learned.actor.tensors(), meta)
         return
     with tqdm(desc="calibrating", total=100, bar_format="{desc}: {percentage:3.0f}%|{bar}|") as bar:
 
@@ -107,8 +151,9 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
                 raise StoppedError
 
         try:
+            workers = min(config.workers, usable_cores())  # here, also after a run on a cluster
             student, facts = calibrate(
-                learned, config.calibration, config.workers, config.seed, tick
+                learned, config.calibration, workers, config.seed, tick, config.plane_share
             )
         except StoppedError:
             interruption.tell(out)
@@ -167,11 +212,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = configure(LowTrainConfig(), args)
         if not args.resume:
             config = fit(config, args.assignments)
-        check_families(config.env.families)
-        check_levels(config.env.levels)
-        check_robot(config.env.robot, config.env.physics)
-        trunk = read_geometry(config.env.robot).trunk_mass
-        check_randomisation(config.env.randomisation, config.env.physics, trunk)
+        check(config)
         meta = {
             "config": to_dict(config.env),
             "seed": config.seed,

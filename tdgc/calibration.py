@@ -26,7 +26,13 @@ from torch import nn
 
 from tdgc import policies
 from tdgc.benchmark.tracking import draw_commands, walk_on_plane
-from tdgc.config import CalibrationConfig, CommandRanges, LowLevelConfig, LowTrainConfig
+from tdgc.config import (
+    CalibrationConfig,
+    CommandRanges,
+    ConfigError,
+    LowLevelConfig,
+    LowTrainConfig,
+)
 from tdgc.files import make_folder
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.jobs import run_jobs
@@ -43,6 +49,8 @@ from tdgc.tasks.rules import is_fallen
 #: Maps the commands asked for to the commands to give instead, (n, 15) -> (n, 15).
 Correction = Callable[[Array], Array]
 
+#: Fewer robots whose walking is measured say nothing about the commands.
+LEAST_ROBOTS = 64
 _STREAM = 3  # of random numbers; training and evaluation have others (``tdgc.sim.terrain``)
 _BATCH = 400  # robots that walk at the same time
 _WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2  # the mean is over the rest
@@ -57,7 +65,8 @@ _PULL = 0.1
 # predictions were arbitrary, and nothing revealed it. The variance of three networks does.
 _NETWORKS, _HIDDEN, _EPOCHS, _MINIBATCH = 3, (128, 64), 300, 256
 _CORRECTIONS = 3000  # minibatches that the corrector is trained on
-_ROBOTS = 120  # in distillation, as in training
+# Robots in distillation, and their share on a plane, as in training.
+_ROBOTS, _PLANE_SHARE = 120, LowTrainConfig().plane_share
 _TURN = 60  # control steps between updates
 _KEPT = 40  # latest turns whose states are learned from
 _UPDATES, _STATES = 120, 1024  # minibatches per turn, and their size
@@ -206,16 +215,19 @@ class Corrector:
 # ------------------------------------------------------------------ the copy
 
 
-def training_tasks(config: LowLevelConfig, robots: int, seed: int) -> list[LowLevelTask]:
-    """The training MDP as late in a run: all commands, all levels, most robots on a plane."""
+def training_tasks(
+    config: LowLevelConfig, robots: int, seed: int, plane_share: float
+) -> list[LowLevelTask]:
+    """The training MDP as late in a run: all commands, all levels, ``plane_share`` on a plane."""
     config = dataclasses.replace(config, command_start=1.0)
-    on_plane = round(LowTrainConfig().plane_share * robots)
+    on_plane = min(round(plane_share * robots), robots - 1)
     seeds = np.random.SeedSequence(seed).generate_state(2).tolist()
+    tiles = LowLevelTask(dataclasses.replace(config, terrain="tiles"), robots - on_plane, seeds[1])
+    tiles.level[:] = np.arange(tiles.num_robots) % config.levels
+    if not on_plane:
+        return [tiles]
     plane = LowLevelTask(dataclasses.replace(config, terrain="plane"), on_plane, seeds[0])
-    tiles = dataclasses.replace(config, terrain="tiles")
-    rugged = LowLevelTask(tiles, robots - on_plane, seeds[1])
-    rugged.level[:] = np.arange(rugged.num_robots) % config.levels
-    return [plane, rugged]
+    return [plane, tiles]
 
 
 def shown(
@@ -305,6 +317,7 @@ def calibrate(
     workers: int,
     seed: int,
     tick: Callable[[float], None] = lambda share: None,
+    plane_share: float = _PLANE_SHARE,
 ) -> tuple[Actor, dict[str, float]]:
     """Measure responses, fit the networks and distil the copy.
 
@@ -314,11 +327,13 @@ def calibrate(
         workers: processes in which the robots walk.
         seed: of everything random here.
         tick: called now and then with the share of the work done; what it raises ends the work.
+        plane_share: of the robots that the copy learns from, as in training.
 
     Returns:
         The student, and facts about its calibration, whose keys include the units.
 
     Raises:
+        ConfigError: most robots fell.
         WorkerError: a worker failed.
     """
     config = load_low(low)[1]
@@ -330,10 +345,15 @@ def calibrate(
         walks.append(walk)
         tick(_WALKING * len(walks) / len(jobs))
     given, reached = (np.concatenate(parts) for parts in zip(*walks, strict=True))
+    if 8 * len(given) < LEAST_ROBOTS:
+        raise ConfigError(
+            f"only {len(given)} of {robots} robots walked without a fall: this policy cannot be "
+            "calibrated"
+        )
     response = ResponseModel(given, reached, config.commands, seed)
     correct = Corrector(response, seed)
     tick(_FITTED)
-    tasks = training_tasks(config, _ROBOTS, seed)
+    tasks = training_tasks(config, _ROBOTS, seed, plane_share)
     try:
         student, first, last = distil(
             low, correct, tasks, turns, seed, lambda done: tick(_FITTED + (1.0 - _FITTED) * done)
@@ -366,15 +386,21 @@ def main(arguments: list[str] | None = None) -> int:
         "--turns", type=int, default=60, help="distillation rounds of 60 control steps each (60)"
     )
     parser.add_argument(
+        "--plane-share", type=float, default=_PLANE_SHARE, metavar="SHARE",
+        help=f"share of the robots that are on a plane while distilling ({_PLANE_SHARE})",
+    )  # fmt: skip
+    parser.add_argument(
         "--workers", type=workers_flag, default="auto", metavar="N",
         help="simulation processes (one per core)",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=42, help="random seed (42)")
     args = parser.parse_args(arguments)
     try:
-        for name, least in (("robots", 64), ("turns", 1), ("seed", 0)):
+        for name, least in (("robots", LEAST_ROBOTS), ("turns", 1), ("seed", 0)):
             if getattr(args, name) < least:
                 raise ValueError(f"--{name} must be {least} or more, not {getattr(args, name)}")
+        if not 0.0 <= args.plane_share < 1.0:
+            raise ValueError(f"--plane-share must be from 0 to below 1, not {args.plane_share:g}")
         low = load_low(args.low)[0]
         make_folder(args.out.parent)
     except (ValueError, OSError) as error:
@@ -385,7 +411,9 @@ def main(arguments: list[str] | None = None) -> int:
         workers = auto_workers(_ROBOTS, usable_cores())
     calibration = CalibrationConfig(args.robots, args.turns)
     try:
-        student, facts = calibrate(low, calibration, workers, args.seed)
+        student, facts = calibrate(
+            low, calibration, workers, args.seed, plane_share=args.plane_share
+        )
         policies.save_copy(args.out, low, student.tensors(), {**low.meta, "calibration": facts})
     except ValueError as error:
         print(f"tdgc.calibration: {error}", file=sys.stderr)

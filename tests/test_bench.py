@@ -127,7 +127,7 @@ def test_what_cannot_be_used_is_one_line_before_anything_is_measured(
     assert not (tmp_path / "out").exists()
 
 
-def no_task(config: LowLevelConfig, robots: int, seed: int) -> LowLevelTask:
+def no_task(config: LowLevelConfig, robots: int, seed: int, first: int) -> LowLevelTask:
     raise RuntimeError(f"no robots today, not even {robots}")
 
 

@@ -142,13 +142,16 @@ def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None
 
 
 def test_robots_learn_on_a_plane_and_on_all_levels() -> None:
-    plane, rugged = training_tasks(CONFIG, 30, seed=0)
+    plane, rugged = training_tasks(CONFIG, 30, seed=0, plane_share=0.6)
     assert (plane.num_robots, rugged.num_robots) == (18, 12)
     assert plane.tiles is None
     assert rugged.level.tolist() == [*range(11), 0]
     for task in (plane, rugged):
         assert (task.commands.share == 1.0).all()
         task.close()
+    (alone,) = training_tasks(CONFIG, 3, seed=0, plane_share=0.0)
+    assert alone.num_robots == 3 and alone.tiles is not None
+    alone.close()
 
 
 def faster(command: Array) -> Array:
@@ -193,7 +196,7 @@ def test_a_student_learns_what_is_done_at_corrected_commands(
     standing = dataclasses.replace(CONFIG.robot, commanded_gait=False)
     config = dataclasses.replace(CONFIG, robot=standing)
     low = save_low(tmp_path / "low", config)
-    tasks = training_tasks(config, 10, seed=0)
+    tasks = training_tasks(config, 10, seed=0, plane_share=0.6)
     try:
         student, first, last = distil(low, faster, tasks, turns=5, seed=0)
     finally:
@@ -229,6 +232,10 @@ def test_script(
     [
         (["--low", "{0}/none"], "none.json: no such file"),
         (["--low", "{0}/low", "--robots", "63"], "--robots must be 64 or more, not 63"),
+        (
+            ["--low", "{0}/low", "--plane-share", "1"],
+            "--plane-share must be from 0 to below 1, not",
+        ),
         (["--low", "{0}/low", "--turns", "0"], "--turns must be 1 or more, not 0"),
         (["--low", "tdgc/pretrained/high"], "high: not a low policy of this package"),
     ],

@@ -39,7 +39,7 @@ class Fragile:
     observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
     action_space = gym.spaces.Box(-9.0, 9.0, (1,), np.float32)
 
-    def __init__(self, robots: int, seed: int) -> None:
+    def __init__(self, robots: int, seed: int, first: int = 0) -> None:
         self.num_robots = robots
         self.rng = np.random.default_rng(seed)
         self.level, self.restarts, self.forgot = 0, 0, 0
@@ -299,7 +299,7 @@ class Poisoned(LowLevelTask):
         self.episodes.elapsed[:] = 0  # so that no episode ends here
 
 
-def make_poisoned(robots: int, seed: int) -> Poisoned:
+def make_poisoned(robots: int, seed: int, first: int = 0) -> Poisoned:
     # With the fixed pose, actions of zero mean standing still, whatever the commands.
     robot = RobotConfig(commanded_pose=False)
     return Poisoned(LowLevelConfig(robot=robot, physics=PhysicsConfig(substeps=4)), robots, seed)

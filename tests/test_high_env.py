@@ -589,6 +589,44 @@ def test_nan_action_is_refused(task):
         task.step(np.full((5, 13), np.nan))
 
 
+def test_a_robot_that_blew_up_gets_no_guidance():
+    """The worker ends its episode, and those of the others; the teacher cannot command it."""
+    config = dataclasses.replace(CONFIG, families=("clutter", "gap"))
+    task = NavigationTask(config, LOW, 2, seed=0, taught=True, landing=Landing())
+    task.reset(np.arange(2))
+    assert task.observe()[:, -GUIDANCE:].any()
+    task.locomotion.world.state.position[0] = np.nan
+    seen = task.observe()
+    assert np.isnan(seen[0]).any() and not seen[:, -GUIDANCE:].any()
+    task.close()
+
+
+@pytest.mark.parametrize(
+    ("cues", "untold"), [("both", False), ("semantic", False), ("geometric", True), ("none", True)]
+)
+def test_without_the_semantic_cue_no_robot_is_told(cues, untold):
+    """So the teacher leaps only where trenches can be seen."""
+    config = dataclasses.replace(CONFIG, families=("gap",), cues=cues, unknown_share=0.0)
+    task = NavigationTask(config, LOW, 2, seed=0, taught=True, landing=Landing())
+    task.reset(np.arange(2))
+    gaits = gait_index(task.teacher.commands(task.locomotion, task.goal))
+    task.close()
+    assert (gaits == (0 if untold else 1)).all()  # trot, or pronk from the start
+
+
+def test_families_are_dealt_to_the_robots_of_the_run():
+    """Whichever worker they are in: a worker of 3 robots after 14 others; and by an env's seed."""
+    config = dataclasses.replace(CONFIG, families=("rough", "stair", "gap", "tilt"), first_levels=3)
+    task = NavigationTask(config, LOW, 3, seed=0, first=14)
+    assert task.tiles.families == ("gap", "tilt", "rough")
+    assert task.curriculum.levels.tolist() == [0, 0, 1]  # the 14th robot is the fourth in Gap
+    task.close()
+    env = gym.make("tdgc/Navigation-v0", config=config)
+    env.reset(seed=6)
+    assert env.unwrapped.task.tiles.families == ("gap",)
+    env.close()
+
+
 def test_gymnasium_and_sb3_accept_it():
     env = gym.make("tdgc/Navigation-v0")
     try:
@@ -596,3 +634,17 @@ def test_gymnasium_and_sb3_accept_it():
         sb3_check_env(env.unwrapped)
     finally:
         env.close()
+
+
+def test_an_episode_begins_with_the_default_command() -> None:
+    """As in the evaluation: the first observation shows nothing of the episode before."""
+    task = NavigationTask(HighLevelConfig(families=("gap",)), PRETRAINED / "low", 2, seed=0)
+    try:
+        task.reset(np.arange(2))
+        assert (task.locomotion.command == default_command()).all()
+        task.locomotion.command[:] = 0.5
+        task.reset(np.array([1]))
+        assert (task.locomotion.command[1] == default_command()).all()
+        assert (task.locomotion.command[0] == 0.5).all()
+    finally:
+        task.close()

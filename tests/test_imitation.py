@@ -144,12 +144,14 @@ def test_a_notebook_keeps_the_last_rollouts_and_mixes_them(apprentice) -> None:
     assert sorted(set(seen)) == [2.0, 3.0, 4.0]  # the last three of five
     assert min(seen.count(number) for number in (2.0, 3.0, 4.0)) > 0.25 * len(seen)
     other = Notebook(3)
-    other.restore(notebook.tensors())
+    other.restore(notebook.tensors(), STEPS)
     np.random.seed(1)
     expected = list(notebook.batches(1))
     np.random.seed(1)
     for batch, wanted in zip(other.batches(1), expected, strict=True):
         assert all(th.equal(part, same) for part, same in zip(batch, wanted, strict=True))
+    with pytest.raises(ValueError, match=f"it has rollouts of {STEPS} decisions, not of 7"):
+        other.restore(notebook.tensors(), 7)
 
 
 def test_what_is_kept_is_not_forgotten() -> None:

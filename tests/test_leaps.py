@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from tdgc.config import CommandRanges
+from tdgc.sim.commands import INDEX
+from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import make_tile
 from tdgc.tasks.leaps import (
@@ -19,6 +21,7 @@ from tdgc.tasks.leaps import (
     leap_command,
     measure_landing,
     speed_up,
+    steer_leap,
 )
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
@@ -197,6 +200,21 @@ class Flail:
         return rng.uniform(-4.0, 4.0, (len(observation), 12)), None
 
 
+def test_a_robot_that_blew_up_teaches_no_landing() -> None:
+    _, config = load_low(PRETRAINED / "low")
+    loco, landings = Locomotion(2, config.robot, config.physics, None, config.gyro), []
+    for blown, rows in ((None, [1]), (np.nan, [0, 1]), (1e4, [0, 1])):
+        loco.place(np.arange(2), np.zeros((2, 2)), np.zeros(2), np.full(2, 0.3))
+        loco.command[:, INDEX["frequency"]] = 2.0
+        if blown is not None:
+            loco.world.state.foot_position[0] = blown
+        landing = Landing()
+        landing.learn(loco, np.array(rows), np.full(len(rows), 0.1), rate=0.1)
+        landings.append((landing.front, landing.spread))
+    loco.world.close()
+    assert landings[1] == landings[2] == landings[0] != (0.0, 0.0)
+
+
 def test_a_low_policy_that_falls_has_no_landing() -> None:
     _, config = load_low(LOW)
     assert measure_landing(Flail(), config) is None  # type: ignore[arg-type]
@@ -219,3 +237,14 @@ def test_who_pushes_off_has_decided(choice: str) -> None:
         assert (np.allclose(chosen[0], 2.9) and np.allclose(chosen[1], 0.36)) == same
         if choice == "lesson":
             assert (chosen.price.max() == 0.0) == same
+
+
+def test_leaps_lead_to_the_goal_whatever_the_heading() -> None:
+    """Velocities are commanded in the heading frame."""
+    bearing, heading = np.array([0.3, -0.1, 0.1]), np.array([0.4, 0.3, -0.3])
+    command = np.zeros((3, 15))
+    steer_leap(command, bearing, heading, CommandRanges())
+    velocity = command[:, [INDEX["vx"], INDEX["vy"]]]
+    np.testing.assert_allclose(np.hypot(*velocity.T), SPEED)
+    np.testing.assert_allclose(np.arctan2(*velocity.T[::-1]) + heading, bearing, atol=1e-12)
+    assert (np.sign(command[:, INDEX["yaw_rate"]]) == -np.sign(heading)).all()

@@ -842,6 +842,41 @@ def test_the_least_of_a_workers_robots_is_on_tiles() -> None:
         task.close()
 
 
+def test_one_robot_that_blows_up_is_truncated_and_stands_again() -> None:
+    env = LowLevelEnv(PLANE)
+    before, _ = env.reset(seed=0)
+    env.task.locomotion.world.strength[0] = np.nan  # of the motors
+    seen, reward, terminated, truncated, _ = env.step(np.zeros(12, dtype=np.float32))
+    assert (seen == before).all() and (reward, terminated, truncated) == (0.0, False, True)
+    env.reset()
+    for _ in range(5):
+        seen, reward, terminated, truncated, _ = env.step(np.zeros(12, dtype=np.float32))
+        assert np.isfinite(seen).all() and np.isfinite(reward) and not (terminated or truncated)
+    env.close()
+
+
+def test_environments_without_a_seed_differ() -> None:
+    envs = [LowLevelEnv(PLANE) for _ in range(2)]
+    first, second = (env.reset()[0] for env in envs)
+    assert (first != second).any()
+    for env in envs:
+        env.close()
+
+
+def test_families_are_dealt_to_all_robots_on_tiles() -> None:
+    """Workers of 2 robots, a third of them on tiles, share three families evenly; so does one."""
+    config = dataclasses.replace(TILES, families=("stair", "gap", "tilt"))
+    for robots in (2, 18):
+        dealt: list[str] = []
+        for first in range(0, 18, robots):
+            task = make_task((PLANE, config), 0.67, robots, 0, first=first)
+            for part in task.tasks if isinstance(task, TaskGroup) else [task]:
+                assert isinstance(part, LowLevelTask)
+                dealt += () if part.tiles is None else part.tiles.families
+            task.close()
+        assert dealt == ["stair", "gap", "tilt"] * 2
+
+
 def test_a_checkpoint_names_what_it_holds() -> None:
     """Later versions resume from a state, so names, shapes and dtypes are fixed."""
     task = begin(TILES, 3, training=True)

@@ -374,14 +374,14 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
 ) -> None:
     """A stopped, killed and resumed run ends in exactly the state of an uninterrupted one.
 
-    Each makes five updates, with half of the robots on tiles. The first run writes no checkpoint
+    Each makes five updates, with half of the robots on tiles. The first run writes one checkpoint
     before its end. The second is stopped after the first update, in the middle of episodes, and
     killed later; it loses its newest checkpoint and continues from the one before.
     """
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert train_low.main([*TINY, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     names = sorted(path.name for path in (whole / "checkpoints").iterdir())
-    assert names == ["step-000000000160"]
+    assert names == ["step-000000000000", "step-000000000160"]
     assert [row["steps"] for row in rows(whole)] == [64, 128, 160]
     assert all(row["memory/mb"] > 100.0 for row in rows(whole))
     assert rows(whole)[1]["reward/track_lin_vel"] > 0.0 and "level/stair" in rows(whole)[1]
@@ -401,12 +401,15 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
         at_calls(patch, stop)
         assert train_low.main([*TINY, "--out", str(broken)]) == 0
     stopped = Checkpoint.read(newest(broken))
-    assert stopped.steps == 32 and stopped.header["phase"] == 0
+    assert stopped.steps == 32 and stopped.header["phase"] == "learning to walk"
     under_way = [state["lengths"] for state in stopped.workers()]
     assert 0 < np.max(under_way) < 20  # of episodes of 20 steps
     # Flags that the run cannot continue with leave its configuration unchanged.
     config = (broken / "config.json").read_text(encoding="utf-8")
     assert train_low.main(["--resume", "--out", str(broken), "--n-envs", "6"]) == 2
+    for flags in (["--seed", "4"], ["--set", "seed=4"]):
+        assert train_low.main(["--resume", "--out", str(broken), *flags]) == 2
+        assert "--resume keeps the run's seed, 3: no other seed" in "".join(capfd.readouterr())
     assert (broken / "config.json").read_text(encoding="utf-8") == config
     last = broken / "checkpoints/step-000000000096"
     kill_run("train_low.py", ["--resume", "--out", str(broken)], last)
@@ -415,6 +418,7 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
     assert "its checksum does not match" in "".join(capfd.readouterr())
     assert final(broken) == final(whole)
+    assert policies.load(whole / "policy").meta["calibration"] == {"robots": 0}
 
     # Resuming a finished run changes nothing.
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
@@ -460,7 +464,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         at_calls(patch, lambda call, run: setattr(run, "reason", "a test" if call == 2 else None))
         assert train_high.main([*arguments, "--out", str(broken)]) == 0
     stopped = Checkpoint.read(newest(broken))
-    assert stopped.steps == 8 and stopped.header["phase"] == 0
+    assert stopped.steps == 8 and stopped.header["phase"] == "imitation"
     # It only continues with the low policy that it began with.
     config = (broken / "config.json").read_text(encoding="utf-8")
     other = tmp_path / "other"
@@ -525,6 +529,7 @@ def test_calibration_ends_a_run_of_the_low_policy(
     """The calibrated copy replaces the policy; an interrupted run ends the same once resumed."""
     monkeypatch.setattr(calibration, "_EPOCHS", 2)
     monkeypatch.setattr(calibration, "_CORRECTIONS", 4)
+    monkeypatch.setattr(calibration, "_ROBOTS", 12)
     arguments = [*TINY, "--steps", "32", "--set", "calibration.robots=64"]
     arguments += ["--set", "calibration.turns=1"]
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -544,6 +549,15 @@ def test_calibration_ends_a_run_of_the_low_policy(
     assert weights(broken) == (whole / "uncalibrated.safetensors").read_bytes()
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
     assert weights(broken) == weights(whole)
+
+    # A run that was to end without it can be calibrated later.
+    later = tmp_path / "later"
+    assert train_low.main([*TINY, "--steps", "32", "--out", str(later)]) == 0
+    assert policies.load(later / "policy").meta["calibration"] == {"robots": 0}
+    resumed = ["--resume", "--set", "calibration.robots=64", "--set", "calibration.turns=1"]
+    assert train_low.main([*resumed, "--out", str(later)]) == 0
+    assert weights(later) == weights(whole)
+    assert "calibration" not in policies.load(later / "uncalibrated").meta
 
 
 def test_faults_of_a_run(
@@ -627,6 +641,10 @@ def test_flags_and_folders_that_cannot_be_used(
             "--set",
             'env.families=["sand"]',
         ],
+        "'env.terrain' has no effect: robots train on both": ["--set", "env.terrain=tiles"],
+        "'ppo.batch_size' must be at least 2, not 1": ["--set", "ppo.batch_size=1"],
+        "'calibration.robots' must be 0 or at least 64": ["--set", "calibration.robots=63"],
+        "--worker-timeout must be above 0 and at most 86400, not inf": ["--worker-timeout", "inf"],
         "terrain 'no.npy' cannot be read as a NumPy": ["--set", 'env.families=["flat","no.npy"]'],
     }
     for message, arguments in cases.items():
@@ -637,6 +655,7 @@ def test_flags_and_folders_that_cannot_be_used(
         assert error.count("\n") == 1
     for setting, message in (
         ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
+        ("env.first_level=3", "'env.first_level' and 'env.first_levels' have no effect with imi"),
         ("env.window=8", "threshold must be above (window + 1) / 2 and at most window, not 3 with"),
         (
             "env.first_levels=20",
@@ -653,6 +672,8 @@ def test_flags_and_folders_that_cannot_be_used(
         ),
         ("start_speed=3", "'start_speed' or 'start_swing' cannot be walked: vx 3.0 is outside "),
         ("ppo.minibatches=0", "'ppo.minibatches' must be at least 1, not 0"),
+        ("ppo.minibatches=101", "'ppo.minibatches' must be at most the 100 robots, not 101"),
+        ("imitation.minibatches=101", "'imitation.minibatches' must be at most the 100 robots"),
         ("ppo.initial_std=0", "'ppo.initial_std' must be above 0, not 0"),
         ("seed=-1", "'seed' must be at least 0, not -1"),
         ("steps=0", "'steps' must be at least 1, not 0"),
@@ -732,7 +753,7 @@ def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_low_policy_is_what_the_first_command_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """``find_low`` takes the low policy of runs/low once it is calibrated, else the shipped one."""
+    """``find_low`` takes the low policy of runs/low once it is final, else the shipped one."""
     shipped = str(PRETRAINED / "low")
     low = policies.load(shipped)
     monkeypatch.chdir(tmp_path)
@@ -740,7 +761,7 @@ def test_the_low_policy_is_what_the_first_command_left(
     left = {key: value for key, value in low.meta.items() if key != "calibration"}
     policies.save_copy(tmp_path / "runs" / "low" / "policy", low, {}, left)
     assert train_high.find_low() == shipped
-    assert "runs/low/policy is not calibrated yet" in "".join(capsys.readouterr())
+    assert "runs/low/policy is not final" in "".join(capsys.readouterr())
     policies.save_copy(
         tmp_path / "runs" / "low" / "policy", low, {}, {**left, "calibration": {"robots": 64}}
     )
@@ -761,6 +782,10 @@ def test_a_run_with_another_robot_takes_what_fits_it(
     assert robot.torque_limit == (23.7, 23.7, 35.5)
     assert "env.robot.kp=30.0" in "".join(capsys.readouterr())
     assert train_low.fit(LowTrainConfig(), ["env.robot.kp=25"]) == LowTrainConfig()
+    # A table may assign several.
+    assigned = [f'env={{"robot": {{"urdf": "{urdf}", "kp": 28}}, "gyro": true}}']
+    robot = train_low.fit(with_overrides(LowTrainConfig(), assigned), assigned).env.robot
+    assert (robot.kp, robot.kd) == (28.0, 0.9)
 
 
 def test_robots_of_a_run() -> None:

@@ -24,8 +24,8 @@ from tdgc.tasks.low_env import LowLevelTask
 CONFIG = LowLevelConfig(episode_seconds=0.5, physics=PhysicsConfig(substeps=4))
 
 
-def make_robots(robots: int, seed: int) -> LowLevelTask:
-    return LowLevelTask(CONFIG, robots, seed)
+def make_robots(robots: int, seed: int, first: int = 0) -> LowLevelTask:
+    return LowLevelTask(CONFIG, robots, seed, first=first)
 
 
 class Counter:
@@ -38,7 +38,7 @@ class Counter:
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 
-    def __init__(self, robots: int, seed: int, fails: str = "") -> None:
+    def __init__(self, robots: int, seed: int, fails: str = "", first: int = 0) -> None:
         if fails == "start":
             raise RuntimeError("no robot to be had")
         self.num_robots, self.seed, self.fails = robots, seed, fails
@@ -88,11 +88,11 @@ class Counter:
         pass
 
 
-def make_counter(robots: int, seed: int) -> Counter:
+def make_counter(robots: int, seed: int, first: int = 0) -> Counter:
     return Counter(robots, seed)
 
 
-def make_failing(where: str, robots: int, seed: int) -> Counter:
+def make_failing(where: str, robots: int, seed: int, first: int = 0) -> Counter:
     return Counter(robots, seed, fails=where)
 
 

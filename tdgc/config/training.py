@@ -39,7 +39,7 @@ class PPOConfig:
 class CalibrationConfig:
     """Calibration of the low policy (``tdgc.calibration``), the last phase of train_low.py."""
 
-    robots: Whole = 4800  # whose walking is measured; 0 leaves the policy as it is
+    robots: Whole = 4800  # whose walking is measured; 0: none
     turns: Count = 60  # rounds of distillation, of 60 control steps each
 
 

@@ -28,7 +28,7 @@ from tdgc.errors import InputError
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and the one before in case that is damaged
-_VERSION = 10  # since the teacher also labels the second way around pillars
+_VERSION = 11  # since episodes begin with the default command
 #: Tensor names of the recurrent learner's LSTM states in the current episodes.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
@@ -168,6 +168,9 @@ class Checkpoint:
                     _, index, slot = key.split(".")
                     state["state"].setdefault(int(index), {})[slot] = value
             model.policy.optimizer.load_state_dict(state)
+            notebook = getattr(model, "notebook", None)
+            if notebook is not None:
+                notebook.restore(tensors, cast(Any, model).n_steps)
         except (RuntimeError, KeyError, ValueError) as error:
             line = str(error).splitlines()[0]
             raise CheckpointError(
@@ -176,9 +179,6 @@ class Checkpoint:
         if _LSTM[0] in tensors:
             h_pi, c_pi, h_vf, c_vf = (tensors[name].to(model.device) for name in _LSTM)
             cast(Any, model)._last_lstm_states = RNNStates(pi=(h_pi, c_pi), vf=(h_vf, c_vf))
-        notebook = getattr(model, "notebook", None)
-        if notebook is not None:
-            notebook.restore(tensors)
         model.num_timesteps = self.steps
         model._n_updates = int(self.header["n_updates"])
         _restore_random(tensors, self.header["random"])

@@ -2,17 +2,29 @@
 
 import argparse
 from pathlib import Path
+from typing import TypeVar
 
 import torch as th
 
-from tdgc.config import ConfigError, read_json, recorded, to_dict, with_overrides
-from tdgc.config.settings import Config
+from tdgc.config import (
+    ConfigError,
+    HighTrainConfig,
+    LowTrainConfig,
+    read_json,
+    recorded,
+    with_overrides,
+)
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.worker import MakeLink, ProcessLink
 
+_LONGEST = 86400.0  # s, of a worker's silence
+TrainConfig = TypeVar("TrainConfig", LowTrainConfig, HighTrainConfig)
 
-def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, unit: str) -> None:
+
+def add_arguments(
+    parser: argparse.ArgumentParser, out: str, config: TrainConfig, unit: str
+) -> None:
     """Add the flags of both trainers.
 
     Args:
@@ -21,11 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, uni
         config: source of all other defaults.
         unit: what ``--steps`` counts, for the help text.
     """
-    default = to_dict(config)
     training = parser.add_argument_group("training")
-    training.add_argument("--steps", type=int, help=f"total number of {unit} ({default['steps']})")
-    training.add_argument("--n-envs", type=int, help=f"number of robots ({default['n_envs']})")
-    training.add_argument("--seed", type=int, help=f"random seed ({default['seed']})")
+    training.add_argument("--steps", type=int, help=f"total number of {unit} ({config.steps})")
+    training.add_argument("--n-envs", type=int, help=f"number of robots ({config.n_envs})")
+    training.add_argument("--seed", type=int, help=f"random seed ({config.seed})")
     training.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
         help="override a setting of tdgc/config, e.g. ppo.n_epochs=4; may be repeated",
@@ -41,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, uni
     machine.add_argument(
         "--workers", type=workers_flag, metavar="N",
         help="simulation processes, or auto: one per core, with at least 10 robots each "
-        f"({default['workers']})",
+        f"({config.workers})",
     )  # fmt: skip
     machine.add_argument(
         "--worker-timeout", type=float, default=300.0, metavar="S",
@@ -51,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser, out: str, config: Config, uni
     machine.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
 
 
-def configure(config: Config, args: argparse.Namespace) -> Config:
+def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
     """Build the run's configuration: the stored one when resuming, else ``config``, then the flags.
 
     With ``--cluster`` this process joins the cluster.
@@ -60,9 +71,12 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
         ConfigError: nothing to resume, a run folder already in use, or an invalid flag.
         ClusterError: the cluster cannot be used, or has fewer CPUs than there are workers.
     """
-    stored = args.out / "config.json"
-    if not args.worker_timeout > 0.0:
-        raise ConfigError(f"--worker-timeout must be above 0, not {args.worker_timeout:g}")
+    stored, seed = args.out / "config.json", None
+    if not 0.0 < args.worker_timeout <= _LONGEST:
+        raise ConfigError(
+            f"--worker-timeout must be above 0 and at most {_LONGEST:g}, "
+            f"not {args.worker_timeout:g}"
+        )
     check_device(args.device)
     if args.resume:
         if args.init is not None:
@@ -71,6 +85,7 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
             raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
         try:
             config = recorded(type(config), read_json(stored), stored)
+            seed = config.seed
         except ConfigError as error:
             raise ConfigError(
                 f"{error}; a run of another version cannot go on: start one in another folder, "
@@ -79,15 +94,16 @@ def configure(config: Config, args: argparse.Namespace) -> Config:
     elif stored.exists():
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
-    given = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
+    given: list[str] = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
     config = with_overrides(config, [*given, *args.assignments])
+    if seed not in (None, config.seed):
+        raise ConfigError(f"--resume keeps the run's seed, {seed}: no other seed")
     cores = usable_cores() if args.cluster is None else connect(args.cluster)
     if args.workers == "auto" and not args.resume:  # a resumed run keeps its number of workers
-        workers = auto_workers(to_dict(config)["n_envs"], cores)
+        workers = auto_workers(config.n_envs, cores)
         config = with_overrides(config, [f"workers={workers}"])
-    workers = to_dict(config)["workers"]
     if args.cluster is not None:
-        check_workers(workers, cores)
+        check_workers(config.workers, cores)
     return config
 
 
@@ -101,7 +117,8 @@ def check_device(name: str) -> None:
         kind = "cpu" if name == "auto" else th.device(name).type
         if kind == "cuda" and not th.cuda.is_available():
             raise RuntimeError("PyTorch finds no GPU here")
-    except RuntimeError as error:
+        th.zeros(1, device="cpu" if name == "auto" else name)
+    except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"--device {name}: {str(error).splitlines()[0]}") from None
 
 

@@ -157,7 +157,9 @@ class Notebook:
             for array in (rollout.observations, rollout.episode_starts, rollout.returns)
         )
         memories = rollout.first_memories()[:, 0]
-        self._rollouts.append(Lessons(observations.half(), starts, returns, memories))
+        lessons = (observations.half(), starts, returns, memories)
+        # On the CPU, where those of a checkpoint are.
+        self._rollouts.append(Lessons(*(tensor.cpu() for tensor in lessons)))
 
     def batches(self, count: int) -> Iterator[Lessons]:
         """Yield ``count`` minibatches: each robot once, in random order, from a random rollout."""
@@ -180,13 +182,21 @@ class Notebook:
             for name, tensor in lessons._asdict().items()
         }
 
-    def restore(self, tensors: Mapping[str, th.Tensor]) -> None:
-        """Restore the rollouts from what ``tensors()`` gave; other names are ignored."""
+    def restore(self, tensors: Mapping[str, th.Tensor], steps: int) -> None:
+        """Restore the rollouts from what ``tensors()`` gave; other names are ignored.
+
+        Raises:
+            ValueError: they are not of ``steps`` decisions, as the next ones will be.
+        """
         self._rollouts.clear()
         number = 0
         while f"{_NOTES}{number}.returns" in tensors:
             parts = (tensors[f"{_NOTES}{number}.{name}"] for name in Lessons._fields)
-            self._rollouts.append(Lessons(*parts))
+            lessons = Lessons(*parts)
+            kept = lessons.returns.shape[1]
+            if kept != steps:
+                raise ValueError(f"it has rollouts of {kept} decisions, not of {steps}")
+            self._rollouts.append(lessons)
             number += 1
 
 

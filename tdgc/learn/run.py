@@ -120,10 +120,10 @@ class Run:
             policies.load(self.init)  # fail before anything is written
         self.folder.mkdir(parents=True, exist_ok=True)
         unsaved: OSError | None = None
-        for number, phase in enumerate(phases):
+        for phase in phases:
             if last is not None and last.steps >= phase.until:
                 continue
-            last, finished, unsaved = self._go_through(phase, number, last)
+            last, finished, unsaved = self._go_through(phase, last)
             if not finished:
                 break
         else:
@@ -135,7 +135,7 @@ class Run:
         return finished
 
     def _go_through(
-        self, phase: Phase, number: int, last: Checkpoint | None
+        self, phase: Phase, last: Checkpoint | None
     ) -> tuple[Checkpoint, bool, OSError | None]:
         """Run one phase from the checkpoint ``last``, or from the start of the run if None.
 
@@ -150,7 +150,7 @@ class Run:
             if last is not None:
                 last.restore(model)
                 states = last.workers()
-                if last.header["phase"] != number:  # episodes end with a phase
+                if last.header["phase"] != phase.name:  # episodes end with a phase
                     states = [without_episodes(state) for state in states]
                     if phase.own_levels:
                         states = [{k: v for k, v in s.items() if k != "curriculum"} for s in states]
@@ -165,17 +165,16 @@ class Run:
             # The latest observations, which SB3 otherwise keeps from the previous rollout.
             model._last_obs, model._last_episode_starts = env.seen(), env.starts()
             model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
-            seconds = 0.0 if last is None else float(last.header["seconds"])
-            callback = RunCallback(self, env, phase.name, number, seconds)
+            callback = RunCallback(self, env, phase.name, last)
             try:
                 finished = learn(model, callback, phase.until)
             except WorkerError:
                 callback.tell_faults()
                 callback.save()
                 raise
-            taken = callback.save()
-            if finished and phase.until < self.config.steps and callback.unsaved is None:
-                callback.save_policy(phase.name)  # keep it beside the policies of later phases
+            # A phase's policy is kept beside those of later phases.
+            keeps = finished and phase.until < self.config.steps
+            taken = callback.save(("policy", phase.name) if keeps else ("policy",))
             return taken, finished, callback.unsaved
         finally:
             env.close()
@@ -191,21 +190,20 @@ class RunCallback(BaseCallback):
     Args:
         run: the run that the phase belongs to.
         env: the workers.
-        name, number: of the phase.
-        seconds_before: wall time of the run so far.
+        name: of the phase.
+        last: the run's newest checkpoint, if there is one.
 
     Attributes:
         unsaved: why the last checkpoint could not be written, or None.
     """
 
-    def __init__(
-        self, run: Run, env: TaskVecEnv, name: str, number: int, seconds_before: float
-    ) -> None:
+    def __init__(self, run: Run, env: TaskVecEnv, name: str, last: Checkpoint | None) -> None:
         super().__init__()
         self.run, self.env = run, env
-        self._name, self._number = name, number
-        self._started = time.monotonic() - seconds_before
-        self._saved_at = 0.0
+        self._name = name
+        self._started = time.monotonic() - (0.0 if last is None else last.header["seconds"])
+        # A run's first checkpoint is written at once, so that it can be resumed whenever it ends.
+        self._saved_at = -math.inf if last is None else self.seconds
         self._logged_at = (0, 0.0)
         self._bar: Any = None
         self._faults: list[dict[str, Any]] = []  # since the last log row
@@ -218,7 +216,6 @@ class RunCallback(BaseCallback):
         return time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
-        self._saved_at = self.seconds
         self._logged_at = (self.num_timesteps, self.seconds)
         self._bar = tqdm(
             desc=self._name,
@@ -254,18 +251,22 @@ class RunCallback(BaseCallback):
         if self.num_timesteps - self._logged_at[0] >= self.run.config.log_steps:
             self.log()
 
-    def save(self) -> Checkpoint:
+    def save(self, names: Sequence[str] = ("policy",)) -> Checkpoint:
         """Write the policy and a checkpoint, or print why not, and return the checkpoint.
+
+        Args:
+            names: of the policy's files in the run folder.
 
         Raises:
             ValueError: the policy is not finite; no checkpoint is written then.
         """
         states = self.env.state_dicts()
-        extra = {"workers": states, "seconds": self.seconds, "phase": self._number}
+        extra = {"workers": states, "seconds": self.seconds, "phase": self._name}
         taken = Checkpoint.take(self.model, extra)
         try:
             # The policy first: if it is not finite, it is refused, and so is the checkpoint.
-            self.save_policy("policy")
+            for name in names:
+                self.save_policy(name)
             taken.save(self.run.folder / "checkpoints")
             self.unsaved = None
         except OSError as error:

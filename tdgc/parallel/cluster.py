@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.errors import InputError, require
-from tdgc.parallel.worker import BLAS_THREADS, Beginning, MakeTask, Worker, WorkerError, keep_memory
-from tdgc.state import State, copies
+from tdgc.parallel.worker import BLAS_THREADS, Arrays, Beginning, Worker, WorkerError, keep_memory
+from tdgc.state import copies
 
 _REACH_SECONDS = 5.0  # limit for connecting to the cluster's address
 _JOIN_SECONDS = 120.0  # limit for every node to start Python and import this package
@@ -163,11 +163,9 @@ def _check_nodes() -> None:
 class _Actor:
     """A worker on some node; each method returns (answer, arrays it changed, pid, address)."""
 
-    def start(
-        self, make_task: MakeTask, views: dict[str, NDArray[Any]], seed: int, state: State | None
-    ) -> tuple[Any, ...]:
+    def start(self, views: dict[str, NDArray[Any]], beginning: Beginning) -> tuple[Any, ...]:
         self._views = copies(views)
-        self._worker = Worker(make_task, self._views, seed, state)
+        self._worker = Worker(self._views, beginning)
         return self._reply(self._worker.task.state_dict(), "obs")
 
     def answer(self, word: str, argument: Any) -> tuple[Any, ...]:
@@ -200,12 +198,13 @@ class ActorLink:
 
     Args:
         worker: its number.
+        arrays: of all robots.
         beginning: what it starts from.
     """
 
-    def __init__(self, worker: int, beginning: Beginning) -> None:
+    def __init__(self, worker: int, arrays: Arrays, beginning: Beginning) -> None:
         self._worker, self._beginning = worker, beginning
-        self._views = beginning.views()
+        self._views = arrays.views(beginning.rows)
         self._pid, self._place = 0, "no node yet"
         self._restarts = 0
         self._begin()
@@ -213,15 +212,12 @@ class ActorLink:
     def _begin(self) -> None:
         import ray
 
-        begin = self._beginning
         self._actor = (
             ray.remote(_Actor)
             .options(num_cpus=1, max_restarts=0, scheduling_strategy="SPREAD")
             .remote()
         )
-        self._reply = self._actor.start.remote(
-            begin.make_task, self._views, begin.seed, begin.state
-        )
+        self._reply = self._actor.start.remote(self._views, self._beginning)
 
     @property
     def pid(self) -> int:
@@ -296,8 +292,8 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
             (answer,), _ = ray.wait(list(running))
             try:
                 done[running.pop(answer)] = ray.get(answer)
-            except ray.exceptions.RayTaskError:
-                raise  # the job's own error
+            except ray.exceptions.RayTaskError as error:
+                raise error.cause from None  # the job's own, without Ray's traceback
             except ray.exceptions.RayError as error:
                 kind = type(error).__name__
                 raise WorkerError(f"a job was lost {_RERUNS + 1} times ({kind})") from error

@@ -1,7 +1,7 @@
 """Several tasks in one worker, combined into one task.
 
 Some robots can then be on a plane, where a control step costs less than half as much, and others
-on terrain. Every worker gets its share of both, however many workers there are.
+on terrain.
 """
 
 import itertools

@@ -77,7 +77,7 @@ class TaskVecEnv(VecEnv):
     steps are raised all the same.
 
     Args:
-        make_task: picklable, called in each worker as ``make_task(robots, seed)``.
+        make_task: picklable, called in each worker.
         num_envs: total number of robots.
         workers: their number; the robots are distributed evenly.
         seed: each worker's seed is derived from it.
@@ -141,7 +141,7 @@ class TaskVecEnv(VecEnv):
     def _start(self, worker: int, state: State | None = None) -> Link:
         seed = worker_seed(self._seed, worker, self._restarts[worker])
         rows = self._rows[worker]
-        return self._link(worker, Beginning(self._make_task, self._arrays, rows, seed, state))
+        return self._link(worker, self._arrays, Beginning(self._make_task, rows, seed, state))
 
     def _replace(self, worker: int, restarts: int, state: State | None = None) -> None:
         """Replace a worker; the caller must wait for the new one's first answer."""

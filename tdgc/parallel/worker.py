@@ -69,7 +69,10 @@ class Task(Protocol):
     def close(self) -> None: ...
 
 
-MakeTask = Callable[[int, int], Task]  # (number of robots, seed) -> task
+class MakeTask(Protocol):
+    """Makes a worker's task; ``first`` is the number of its first robot among those of the run."""
+
+    def __call__(self, robots: int, seed: int, *, first: int) -> Task: ...
 
 
 class WorkerError(RuntimeError):
@@ -117,15 +120,15 @@ class Arrays:
             "truncated": RawArray("b", num),
         }
 
-    def views(self) -> dict[str, NDArray[Any]]:
-        """Views by name: actions, obs, last_obs (of ended episodes), rewards and the two flags."""
+    def views(self, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
+        """Views of ``rows``: actions, obs, last_obs (of ended episodes), rewards, the two flags."""
         num, obs_dim, action_dim = self._shape
         width = {"actions": action_dim, "obs": obs_dim, "last_obs": obs_dim}
         views: dict[str, NDArray[Any]] = {}
         for name, raw in self._raw.items():
             dtype = np.float32 if name in (*width, "rewards") else np.int8
             flat: NDArray[Any] = np.frombuffer(raw, dtype=dtype)
-            views[name] = flat.reshape(num, width[name]) if name in width else flat
+            views[name] = (flat.reshape(num, width[name]) if name in width else flat)[rows]
         return views
 
 
@@ -133,25 +136,20 @@ class Beginning(NamedTuple):
     """What a worker starts from.
 
     Attributes:
-        make_task: picklable, called where the worker runs as ``make_task(robots, seed)``.
-        arrays: of all robots.
-        rows: the worker's rows of ``arrays``.
+        make_task: picklable, called where the worker runs.
+        rows: the worker's robots among those of the run.
         seed: of its task.
         state: of a failed worker that this one replaces; all but its ``rng`` is used.
     """
 
     make_task: MakeTask
-    arrays: Arrays
     rows: slice
     seed: int
     state: State | None = None
 
-    def views(self) -> dict[str, NDArray[Any]]:
-        """The worker's rows of the arrays."""
-        return {name: view[self.rows] for name, view in self.arrays.views().items()}
 
-
-MakeLink = Callable[[int, Beginning], Link]  # (its number, what it starts from) -> worker
+# (its number, the arrays of all robots, what it starts from) -> worker
+MakeLink = Callable[[int, Arrays, Beginning], Link]
 
 
 def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
@@ -197,12 +195,11 @@ def _load(task: Task, views: dict[str, NDArray[Any]], state: State) -> None:
 
 
 class Worker:
-    """Some robots of a task with the arrays ``views``; other arguments as in ``Beginning``."""
+    """Some robots of a task with the arrays ``views``, their own rows only."""
 
-    def __init__(
-        self, make_task: MakeTask, views: dict[str, NDArray[Any]], seed: int, state: State | None
-    ) -> None:
-        self.task, self._views = make_task(len(views["rewards"]), seed), views
+    def __init__(self, views: dict[str, NDArray[Any]], beginning: Beginning) -> None:
+        make_task, rows, seed, state = beginning
+        self.task, self._views = make_task(rows.stop - rows.start, seed, first=rows.start), views
         if state is not None:
             _load(self.task, views, {**state, "rng": self.task.state_dict()["rng"]})
         self._blow_ups = 0
@@ -255,7 +252,7 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _serve(pipe: Connection, beginning: Beginning) -> None:
+def _serve(pipe: Connection, arrays: Arrays, beginning: Beginning) -> None:
     """Run a worker: send its state, then answer one request at a time until ``close``."""
     # The parent handles the signals that a terminal or a batch system sends to all processes.
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -263,8 +260,7 @@ def _serve(pipe: Connection, beginning: Beginning) -> None:
     end_with_parent()
     worker: Worker | None = None
     try:
-        views = beginning.views()
-        worker = Worker(beginning.make_task, views, beginning.seed, beginning.state)
+        worker = Worker(arrays.views(beginning.rows), beginning)
         pipe.send(worker.task.state_dict())
         while True:
             word, argument = pipe.recv()
@@ -339,15 +335,19 @@ class ProcessLink:
 
     Args:
         worker: its number.
+        arrays: of all robots.
         beginning: what it starts from.
     """
 
-    def __init__(self, worker: int, beginning: Beginning) -> None:
+    def __init__(self, worker: int, arrays: Arrays, beginning: Beginning) -> None:
         context = mp.get_context("spawn")
         self._worker = worker
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(theirs, beginning), daemon=True, name=f"tdgc-worker-{worker}"
+            target=_serve,
+            args=(theirs, arrays, beginning),
+            daemon=True,
+            name=f"tdgc-worker-{worker}",
         )
         with one_blas_thread(), _without_script(beginning.make_task):
             self._process.start()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tdgc.config import HighLevelConfig, HighRewardConfig
 from tdgc.policies import Policy
-from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, gait_index
+from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, default_command, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import observe
@@ -25,7 +25,7 @@ from tdgc.tasks import rewards
 from tdgc.tasks.approach import Approach
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.high_observation import SEMANTIC, Seen, high_layout, high_spaces
+from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, Seen, high_layout, high_spaces
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBES, HeightProbes
@@ -103,6 +103,7 @@ class NavigationTask:
         led: number of decisions per robot over which the share of episodes that the teacher drives
             falls from all to none.
         landing: where the low policy's feet land in leaps, for the teacher.
+        first: number of the first robot among those of the run; families are dealt by number.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class NavigationTask:
         taught: bool = False,
         led: float = 0.0,
         landing: Landing | None = None,
+        first: int = 0,
     ) -> None:
         self.low, self.low_config = load_low(low)
         self.config = config = paired(config, self.low_config)
@@ -127,11 +129,11 @@ class NavigationTask:
         self.step_seconds = config.decimation * self.low_config.physics.control_dt
         self.horizon = round(config.episode_seconds / self.step_seconds)
         self._hold = round(config.hold_seconds / self.step_seconds)
-        self.family = np.arange(m) % len(config.families)
-        first = np.arange(m) // len(config.families) % config.first_levels + config.first_level
+        rank, self.family = np.divmod(first + np.arange(m), len(config.families))
+        levels = rank % config.first_levels + config.first_level
         if config.curriculum == "hardest":
-            first[:] = config.levels - 1
-        self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, first)
+            levels[:] = config.levels - 1
+        self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, levels)
         alter = None
         if training and config.shallowest_trench is not None:
             alter = functools.partial(shallow, shallowest=config.shallowest_trench)
@@ -143,7 +145,9 @@ class NavigationTask:
         self.goal = np.zeros((m, 2))
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._reached_at = np.full(m, -1)
-        self._untold = np.zeros(m, dtype=bool)  # not told its family in this episode
+        # Not told its family in this episode: without the semantic cue, no robot is.
+        self._semantic = config.cues in ("both", "semantic")
+        self._untold = np.full(m, not self._semantic)
         self._next_push = np.zeros(m)
         disturbed = config.randomisation, self.rng, self.step_seconds
         self._pushes = Pushes(*disturbed, self._next_push)
@@ -186,10 +190,12 @@ class NavigationTask:
             width = self._width()[index]
             self.locomotion.randomise(index, self.config.randomisation, rng, width)
             self._pushes.schedule(index, self.elapsed)
-            self._untold[index] = rng.uniform(size=n) < self.config.unknown_share
+            untold = rng.uniform(size=n) < self.config.unknown_share
+            self._untold[index] = untold | (not self._semantic)
         self._actions[:, index] = 0.0
         middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
         self._commands[:, index] = command_share(middle, self.decoder)
+        self.locomotion.command[index] = default_command()  # as in the evaluation
         self.locomotion.place(
             index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
         )
@@ -285,7 +291,11 @@ class NavigationTask:
         )
         if self.teacher is None:
             return seen
-        return np.concatenate([seen, self._guidance(self.teacher)], axis=1, dtype=np.float32)
+        if np.isfinite(seen).all():
+            guidance = self._guidance(self.teacher)
+        else:  # a robot has blown up, which ends all episodes (``tdgc.parallel.worker``)
+            guidance = np.zeros((self.num_robots, GUIDANCE))
+        return np.concatenate([seen, guidance], axis=1, dtype=np.float32)
 
     def _guidance(self, teacher: Teacher) -> Array:
         """The teacher's guidance, (M, ``GUIDANCE``), in the order of ``GUIDANCE_PARTS``."""
@@ -411,7 +421,8 @@ class NavigationEnv(TaskEnv):
 
     Observations are those of ``high_layout``, (92,) by default. Actions are (13,) in [-1, 1]: the
     continuous commands in the order of ``tdgc.sim.commands.CONTINUOUS``, then the gait. A step is
-    one decision, 0.1 s.
+    one decision, 0.1 s. The seed chooses the family: its place among the configured ones is the
+    seed modulo their number.
 
     Args:
         config: the MDP's configuration; the default one if None.
@@ -432,6 +443,8 @@ class NavigationEnv(TaskEnv):
     ) -> None:
         self.config = config or HighLevelConfig()
         super().__init__(
-            lambda seed, visual: NavigationTask(self.config, low, 1, seed, visual=visual),
+            lambda seed, visual: NavigationTask(
+                self.config, low, 1, seed, visual=visual, first=seed % len(self.config.families)
+            ),
             render_mode,
         )

@@ -59,6 +59,8 @@ _RISE, _REACHED = 0.3, 0.95  # time constant in s; share of the commanded speed 
 # factor of e, and how many Hz and m it may be from the best, so that a short leap is never averaged
 # with a long one.
 _TEMPERATURE, _NEAR = 0.05, (0.35, 0.03)
+# m: with legs of 0.4 m, a foot can only land further from its foothold if the robot has blown up.
+_REACH = 1.0
 
 
 def lead(speed: Array, frequency: Array) -> Array:
@@ -113,9 +115,13 @@ class Landing:
             trunk = state.position[seen, 0] - clock[landed] / frequency * speed
             front, rear = feet[:, :2].mean(axis=1), feet[:, 2:].mean(axis=1)
             foothold = trunk + 0.5 * length + lead(speed, frequency)
-            weight = 1.0 - (1.0 - rate) ** seen.size
-            self.front += weight * float(np.mean(front - foothold) - self.front)
-            self.spread += weight * float(np.mean(front - rear - length) - self.spread)
+            missed = np.stack([front - foothold, front - rear - length])
+            missed = missed[:, (np.abs(missed) < _REACH).all(axis=0)]  # false for NaN, too
+            if missed.size:
+                weight = 1.0 - (1.0 - rate) ** missed.shape[1]
+                mean = missed.mean(axis=1).tolist()
+                self.front += weight * (mean[0] - self.front)
+                self.spread += weight * (mean[1] - self.spread)
 
 
 def foothold_risk(x: NDArray[np.floating], trenches: Array, clear: float = CLEAR) -> Array:
@@ -282,7 +288,7 @@ def steer_leap(command: Array, bearing: Array, heading: Array, ranges: CommandRa
         ranges: bounds of the velocities.
     """
     wanted = (
-        ("vx", SPEED * np.cos(bearing)), ("vy", SPEED * np.sin(bearing)),
+        ("vx", SPEED * np.cos(bearing - heading)), ("vy", SPEED * np.sin(bearing - heading)),
         ("yaw_rate", -_TURN * heading),
     )  # fmt: skip
     for name, value in wanted:

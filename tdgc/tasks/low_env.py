@@ -54,6 +54,7 @@ class LowLevelTask:
         training: draw noise, pushes and randomised dynamics, and let levels and command ranges
             change.
         visual: keep what rendering needs.
+        first: number of the first robot among those of the run; families are dealt by number.
 
     Attributes:
         level: (M,) level of each robot's tile.
@@ -70,6 +71,7 @@ class LowLevelTask:
         seed: int,
         training: bool = True,
         visual: bool = False,
+        first: int = 0,
     ) -> None:
         self.config, self._visual = config, visual
         self.num_robots = m = num_robots
@@ -78,7 +80,7 @@ class LowLevelTask:
         self.horizon = round(config.episode_seconds / config.physics.control_dt)
         self._command_steps = round(config.command_seconds / config.physics.control_dt)
         self.level = self.rng.integers(0, min(config.first_levels, config.levels), m)
-        self.column = np.arange(m) % len(config.families)
+        self.column = (first + np.arange(m)) % len(config.families)
         on_tiles = config.terrain == "tiles"
         families = [config.families[c] if on_tiles else FLAT for c in self.column]
         alter = functools.partial(shallow, shallowest=config.crossing.shallowest_trench)
@@ -357,18 +359,26 @@ class LowLevelTask:
 
 
 def make_task(
-    config: tuple[LowLevelConfig, LowLevelConfig], share: float, robots: int, seed: int
+    config: tuple[LowLevelConfig, LowLevelConfig],
+    share: float,
+    robots: int,
+    seed: int,
+    *,
+    first: int = 0,
 ) -> Task:
-    """Make a worker's task: a ``share`` of its robots in the first MDP; the rest, at least one, in
-    the second."""
-    first = min(round(share * robots), robots - 1)
-    if not first:
-        return LowLevelTask(config[1], robots, seed)
-    seeds = np.random.SeedSequence(seed).generate_state(2)
+    """Make a worker's task: a ``share`` of the run's robots in the first MDP, the rest, at least
+    one in the run, in the second. ``first`` robots of the run are in the workers before it."""
+    before = math.floor(share * first)
+    here = math.floor(share * (first + robots)) - before
+    numbers, firsts = (here, robots - here), (before, first - before)
+    if not all(numbers):
+        only = int(not here)
+        return LowLevelTask(config[only], robots, seed, first=firsts[only])
+    seeds = np.random.SeedSequence(seed).generate_state(2).tolist()
     return TaskGroup(
         [
-            LowLevelTask(mdp, number, int(own))
-            for mdp, number, own in zip(config, (first, robots - first), seeds, strict=True)
+            LowLevelTask(mdp, number, own, first=place)
+            for mdp, number, own, place in zip(config, numbers, seeds, firsts, strict=True)
         ]
     )
 
@@ -379,7 +389,8 @@ class LowLevelEnv(TaskEnv):
     Observations are what the actor sees (``tdgc.sim.locomotion.actor_layout``), followed by what
     only the critic sees (``CRITIC_LAYOUT``), (90 + 40,) by default. Actions are (12,) in [-4, 4]:
     offsets of the joint targets from q0 (``Locomotion.pose``), in units of ``action_scale``, for
-    hips times ``hip_scale``. A step is one control step, 0.02 s.
+    hips times ``hip_scale``. A step is one control step, 0.02 s. On tiles the seed chooses the
+    family: its place among the configured ones is the seed modulo their number.
 
     Args:
         config: the MDP's configuration; the default one, on a plane, if None.
@@ -391,5 +402,8 @@ class LowLevelEnv(TaskEnv):
     ) -> None:
         self.config = config or LowLevelConfig()
         super().__init__(
-            lambda seed, visual: LowLevelTask(self.config, 1, seed, visual=visual), render_mode
+            lambda seed, visual: LowLevelTask(
+                self.config, 1, seed, visual=visual, first=seed % len(self.config.families)
+            ),
+            render_mode,
         )

@@ -7,6 +7,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from tdgc.parallel.worker import SANE
+
 
 class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """A task with one robot as a Gymnasium environment.
@@ -14,7 +16,8 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     This is the MDP used in training: dynamics are randomised, the robot is pushed, sensors are
     noisy, and levels change with success. ``reset`` keeps the robot's level; ``reset(seed=...)``
     rebuilds the task from that seed, so that everything after it is repeatable.
-    ``info["is_success"]`` reports whether the robot has reached its goal or crossed its tile.
+    ``info["is_success"]`` reports whether the robot has reached its goal or crossed its tile. As in
+    training, a robot that blows up earns nothing in that step and is truncated.
 
     Args:
         make_task: (seed, whether to render) -> a task with one robot.
@@ -26,7 +29,8 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __init__(self, make_task: Callable[[int, bool], Any], render_mode: str | None) -> None:
         self.render_mode = render_mode
         self._make_task = make_task
-        self.task = make_task(0, render_mode is not None)
+        # Without a seed, each environment is another one.
+        self.task = make_task(int(np.random.SeedSequence().generate_state(1)[0]), self._rendered)
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space
 
@@ -36,9 +40,10 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         super().reset(seed=seed)
         if seed is not None:
             self.task.close()
-            self.task = self._make_task(seed, self.render_mode is not None)
+            self.task = self._make_task(seed, self._rendered)
         self.task.reset(np.arange(1))
-        return self.task.observe()[0], {}
+        self._seen = self.task.observe()[0]
+        return self._seen, {}
 
     def step(
         self, action: NDArray[np.float32]
@@ -46,7 +51,15 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward, terminated, truncated = self.task.step(np.asarray(action)[None])
         info = {"is_success": bool(self.task.reached[0])}
         obs = self.task.observe()[0]
+        if not (np.abs([*obs, reward[0]]) <= SANE).all():  # false for NaN, too
+            self.task.restart()
+            return self._seen, 0.0, False, True, info
+        self._seen = obs
         return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    @property
+    def _rendered(self) -> bool:
+        return self.render_mode is not None
 
     def render(self) -> NDArray[np.uint8] | None:
         if self.render_mode is None:
