@@ -32,8 +32,8 @@ from tdgc.benchmark.results import FILES, STOPS, describe, salvage, what_stopped
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
-from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
-from tdgc.errors import require
+from tdgc.config import HighLevelConfig, LowLevelConfig
+from tdgc.errors import InputError, require
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
 from tdgc.parallel.cores import usable_cores
@@ -155,6 +155,8 @@ class Evaluation:
                 raise ValueError("--gui shows a robot of this machine: no --cluster")
             if self.filmed or self.traced is not None:
                 raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
+        if self.mode == "drive" and self.tuning is not None:
+            raise ValueError("--gui drive is of the low policy alone: no --tune or --set")
         if self.mode == "tracking":
             if self.filmed:
                 raise ValueError("--tracking has no episodes to film: no --video")
@@ -418,13 +420,15 @@ def run_tracking(evaluation: Evaluation, low: Policy) -> None:
 
 def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> None:
     """Show a robot on the first tile of the first family and level until the window is closed."""
-    policy, driver = next(iter(drivers.items()))
+    policy = next(iter(drivers))
+    if policy == "tdgc" and TUNED in drivers:
+        policy = TUNED
     cell = Cell(policy, "nominal", evaluation.families[0], evaluation.levels[0], 0, 1)
     try:
         if evaluation.mode == "drive":
             gui.drive(low, cell, evaluation.seed)
         else:
-            gui.watch(low, driver, cell, evaluation.seed)
+            gui.watch(low, drivers[policy], cell, evaluation.seed)
     except KeyboardInterrupt:
         pass  # equivalent to closing the window
 
@@ -451,7 +455,7 @@ def main(arguments: list[str] | None = None) -> int:
             problems = run_table(evaluation, low, drivers, trained_on)
         else:
             run_window(evaluation, low, drivers)
-    except (ConfigError, WindowError) as error:  # Bullet cannot load the robot or open its window
+    except (InputError, WindowError) as error:  # Bullet cannot load the robot or open its window
         fail(error)
         return 2
     except STOPS as error:

@@ -321,7 +321,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     pair, controller = load_pair(low, high), Controller(folder, form)
     config, limit = pair.low_config, pair.low_config.robot.action_limit
     driver = HierarchyDriver(pair.high, pair.high_config)
-    decoder = CommandDecoder(driver.bounds, pair.high_config.action_limit)
+    decoder = CommandDecoder(driver.bounds, pair.high_config.action_limit, pair.high_config.gaits)
     field = TileField((1, 1))
     field.place(0, 0, make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
     start, goal = field.starts[:, 0], field.goals[:, 0]

@@ -12,7 +12,7 @@ import pytest
 import evaluate
 import train_high
 from tdgc import policies
-from tdgc.ablate.__main__ import choose, main, plan
+from tdgc.ablate.__main__ import choose, main, plan, without_missing
 from tdgc.ablate.table import Found, describe, rows
 from tdgc.ablate.trials import Result, Runner, Trial
 from tdgc.ablate.variants import HELPS, VARIANTS, WHOLE, Variant, variants
@@ -202,7 +202,7 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
 def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Five minibatches of 4 robots' 6 steps hold 4 steps each, fewer than one robot's rollout.
+    """Five minibatches are more than there are robots.
 
     So ``full`` fails, and with it ``fixed-pose``, which needs it; ``gp`` needs no training.
     """
@@ -211,10 +211,7 @@ def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
     flags = [*TINY, "--set", "ppo.minibatches=5", "--only", "full,fixed-pose,gp"]
     assert main([*flags, "--out", str(tmp_path)]) == 1
     table = json.loads((tmp_path / "ablation.json").read_text())["rows"]
-    assert table[0]["errors"] == {
-        "42": "a minibatch of 4 steps does not hold the 6 of one environment; take fewer "
-        "minibatches or more environments"
-    }
+    assert table[0]["errors"] == {"42": "'ppo.minibatches' must be at most the 4 robots, not 5"}
     assert table[1]["errors"] == {"42": "it needs 'full' with seed 42, which is missing"}
     assert (table[2]["n"], table[2]["errors"]) == (1, {})
     assert capsys.readouterr().err.count("tdgc.ablate: ") == 2
@@ -272,6 +269,37 @@ def test_a_damaged_trial_is_named_and_the_others_are_kept(
     full, trot = json.loads((tmp_path / "ablation.json").read_text())["rows"]
     assert (full["n"], full["rate"], full["errors"]) == (1, 1.0, {})
     assert "n" not in trot and trot["errors"]["42"].startswith(message.format(path))
+
+
+def test_a_report_has_all_that_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Later trials also while an earlier one is missing, and ``full`` although it is not asked for.
+
+    The same folder on other tiles of a map is refused.
+    """
+    for name in ("full-42", "trot-42"):
+        finish(tmp_path / name)
+    asked = ["--only", "semantic,trot", "--time-limit", "0", "--out", str(tmp_path)]
+    assert main([*TINY, *asked]) == 0
+    semantic, trot = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert (semantic["name"], trot["n"], trot["versus"]["n"]) == ("semantic", 1, 1)
+    assert "n" not in semantic
+    settings = json.loads((tmp_path / "settings.json").read_text())
+    (tmp_path / "settings.json").write_text(json.dumps(settings | {"maps": {"hills.npy": 7}}))
+    capsys.readouterr()
+    assert main([*TINY, *asked]) == 2
+    assert "holds an ablation with maps {'hills.npy': 7}, not {}" in capsys.readouterr().err
+
+
+def test_without_an_uncalibrated_policy_its_variants_are_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [variant.name for variant in without_missing(VARIANTS, LOW)]
+    assert "uncalibrated" not in names and "gp-uncalibrated" not in names
+    assert len(names) == len(VARIANTS) - 2
+    said = capsys.readouterr().out
+    assert said.startswith("without uncalibrated and gp-uncalibrated: there is no '")
+    (tmp_path / "uncalibrated.json").touch()
+    assert without_missing(VARIANTS, tmp_path / "policy") == list(VARIANTS)
 
 
 def test_time_that_is_over_stops_before_a_trial(

@@ -18,9 +18,10 @@ from tdgc.benchmark.diagnosis import (
     describe,
     diagnose,
     features,
+    has_looked,
     place_of,
 )
-from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, load_high
+from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, TeacherDriver, load_high
 from tdgc.benchmark.evaluation import Cell, Episode, run_cell, tile_of
 from tdgc.benchmark.planted import Blindfold, SwappedBounds, WeakMotor, measured_limits
 from tdgc.benchmark.trace import COLUMNS, Trace, Tracer
@@ -226,6 +227,32 @@ def test_the_baseline_is_not_blamed_on_the_low_level_in_gap(low):
     failures = [diagnose(t, HIPS) for t in tracer.traces() if t.outcome != "reached"]
     assert len(failures) >= 2
     assert {f.cause for f in failures} == {"walked blindly into a trench"}
+
+
+def test_the_teacher_is_not_blind(low):
+    driver = TeacherDriver(*low)
+    tracer = Tracer(driver, planted.SEED)
+    run_cell(Cell("teacher", "nominal", "gap", 4, 0, 1), low[0], driver, planted.SEED, [tracer])
+    (trace,) = tracer.traces()
+    assert set(trace["family"]) == {"gap"} and has_looked(trace)
+
+
+def test_an_obstacle_of_a_map_is_the_decisions_fault(tmp_path):
+    """A wall 0.4 m high across the tile; elsewhere on it the usual rules apply."""
+    heights = np.zeros((161, 161))
+    heights[80:84] = 0.4
+    path = str(tmp_path / "wall.npy")
+    np.save(path, heights)
+    into = ((3.0, 4.0), (3.8, 4.0))
+    assert verdict(walk(path, 10, "collided", track=into)) == (
+        "decisions", "steered into an obstacle"
+    )  # fmt: skip
+    pushing = walk(path, 10, "timeout", track=((3.7, 4.0), (3.7, 4.0)), error_vx=-0.5)
+    assert verdict(pushing) == ("decisions", "held up by an obstacle")
+    away = walk(path, 10, "timeout", track=((0.8, 4.0), (1.0, 4.0)), error_vx=-0.5)
+    assert verdict(away) == ("execution", "lost track of velocity")
+    tripped = walk(path, 10, "collided", track=((0.8, 4.0), (2.5, 4.0)))
+    assert verdict(tripped) == ("execution", "lost its footing on the way to the goal")
 
 
 def test_a_pillar_in_the_way_is_the_decisions_fault():

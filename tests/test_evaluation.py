@@ -32,8 +32,10 @@ from tdgc.benchmark.evaluation import (
 )
 from tdgc.benchmark.trace import Selection
 from tdgc.benchmark.tracking import track_gait
+from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, RandomisationConfig
 from tdgc.parallel.worker import WorkerError
+from tdgc.show import gui
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
@@ -129,6 +131,10 @@ def test_physics_is_the_benchmarks_whatever_a_policy_was_trained_in() -> None:
     found = physics_of(LowLevelConfig(physics=easy), CONDITIONS["nominal"])
     assert found == PhysicsConfig(control_dt=0.04, substeps=16)
     assert (found.dt, found.friction, found.hold) == (0.0025, 0.8, 2)
+    # A control step that is no multiple of the joint control's gets a finer physics step.
+    odd = PhysicsConfig(control_dt=0.0125, substeps=6)
+    found = physics_of(LowLevelConfig(physics=odd), CONDITIONS["nominal"])
+    assert (found.joint_steps, found.dt) == (3, pytest.approx(0.0125 / 6))
 
 
 def test_pushes_have_their_size_and_are_paired():
@@ -385,12 +391,23 @@ def test_an_evaluation_checks_itself():
     assert (whole.mode, whole.levels, whole.policies) == ("table", (6, 7, 8, 9, 10), ("gp",))
     for change, message in (
         ({"mode": "watch", "cluster": "auto"}, "--gui shows a robot of this machine"),
+        ({"mode": "drive", "tuning": Tuning()}, "--gui drive is of the low policy alone"),
         ({"mode": "tracking", "filmed": 1}, "--tracking has no episodes to film"),
         ({"policies": ("tdgc",), "high": None}, "no high policy is shipped"),
         ({"policies": ("teacher",), "conditions": ("no-family",)}, "it cannot lead in no-family"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             dataclasses.replace(whole, **change)
+
+
+def test_the_window_shows_the_tuned_policy(monkeypatch):
+    flags = ["--gui", "watch", "--workers", "1", "--policies", "tdgc"]
+    shown = []
+    monkeypatch.setattr(gui, "watch", lambda low, driver, cell, seed: shown.append((driver, cell)))
+    assert evaluate.main(flags) == evaluate.main([*flags, "--set", "safety.max_speed=0.3"]) == 0
+    (plain, first), (tuned, second) = shown
+    assert (first.policy, second.policy) == ("tdgc", "tdgc-tuned")
+    assert not isinstance(plain, TunedDriver) and isinstance(tuned, TunedDriver)
 
 
 def test_the_baseline_keeps_to_what_the_low_policy_was_trained_on(low):

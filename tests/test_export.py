@@ -366,6 +366,13 @@ def test_check_finds_other_weights(tmp_path: Path) -> None:
     assert export.check(tmp_path, "torchscript", LOW, other).difference > TOLERANCE
 
 
+def test_check_knows_which_gaits_a_policy_has(tmp_path: Path) -> None:
+    trot = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0, gaits=("trot",))
+    high = random_high(tmp_path / "trot", trot)
+    export.write(export.load_pair(LOW, high), tmp_path, ["torchscript"])
+    assert export.check(tmp_path, "torchscript", LOW, high).difference <= TOLERANCE
+
+
 def without_sources(table: dict[str, Any]) -> None:
     """Remove from an interface which inputs come from the other graph."""
     for signal in table["inputs"]:

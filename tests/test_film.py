@@ -224,6 +224,25 @@ def test_a_film_can_be_decoded(tmp_path: Path) -> None:
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".gif", ".mp4"]
 
 
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"condition": "friction-0.4"}, "film_gp_friction-0.4_gap_08_000"),
+        ({"family": "hills.npy", "level": 3}, "film_gp_nominal_hills.npy_03_000"),
+    ],
+)
+def test_a_films_name_is_kept_whole(
+    changes: dict[str, Any], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The report looks for it; cut at a dot, films would overwrite each other."""
+    monkeypatch.chdir(tmp_path)
+    np.save("hills.npy", np.zeros((161, 161)))
+    films = tmp_path / "films"
+    films.mkdir()
+    film.film(planted(2, **changes), films)
+    assert sorted(path.name for path in films.iterdir()) == [f"{name}.gif", f"{name}.mp4"]
+
+
 def test_a_film_that_fails_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def break_off(recording: Recording) -> Any:
         yield Image.new("RGB", film.SIZE)

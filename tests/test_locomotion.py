@@ -453,6 +453,23 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
     task.close()
 
 
+def test_latency_is_kept_at_a_faster_control_rate() -> None:
+    """At 100 Hz, a target takes effect three steps after the action, as does one of 50 Hz that is
+    30 ms late after one and a half."""
+    physics = PhysicsConfig(control_dt=0.01, substeps=4)
+    loco = Locomotion(1, RobotConfig(), physics, None)
+    assert loco.targets.shape == (5, 1, 12)
+    loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+    loco.delay[:] = 0.03
+    targets = []
+    for action in (1.0, 0.0, 0.0, 0.0):
+        loco.act(np.full((1, 12), action))
+        targets.append(loco.world._wanted(loco.targets, loco.delay, loco.joint_offset)[0, 0])
+    loco.world.close()
+    moved = [np.abs(target - loco.nominal).max() > 0.1 for target in targets]
+    assert moved == [False, False, False, True]
+
+
 def test_phases_follow_the_clock_of_a_placed_robot() -> None:
     """``place`` updates the phases, so the high policy's first observation shows the new clock."""
     loco = Locomotion(2, RobotConfig(), PhysicsConfig(), None)

@@ -193,6 +193,23 @@ def test_a_timestep_must_fit_the_control() -> None:
         MujocoConfig(timestep=0.003).physics(0.02, 200.0)
 
 
+@pytest.mark.parametrize("visual", [False, True])
+def test_meshes_are_found_beside_the_urdf(visual: bool, tmp_path: Path) -> None:
+    """Those of collision shapes, also where a window shows the visual shapes too."""
+    text = (Path(export.__file__).parents[1] / ROBOT.urdf).read_text()
+    box = '<collision><origin xyz="0 0 0" rpy="0 0 0"/><geometry><box size="0.42 0.15 0.11"/>'
+    assert box in text
+    mesh = '<collision><geometry><mesh filename="meshes/trunk.obj"/>'
+    (tmp_path / "robot.urdf").write_text(text.replace(box, mesh))
+    corners = "v 0.2 0 0\nv -0.2 0.1 0\nv -0.2 -0.1 0\nv 0 0 0.1\n"
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "trunk.obj").write_text(f"{corners}f 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n")
+    robot = dataclasses.replace(ROBOT, urdf=str(tmp_path / "robot.urdf"))
+    config = MujocoConfig()
+    world = MujocoWorld(robot, config.physics(0.02, 200.0), TileField((1, 1)), config, visual)
+    assert world.model.nmesh == 1
+
+
 def test_a_urdf_that_mujoco_cannot_load_is_one_line(tmp_path: Path) -> None:
     text = (Path(export.__file__).parents[1] / ROBOT.urdf).read_text()
     box = '<geometry><box size="0.42 0.15 0.11"/></geometry>'
@@ -508,6 +525,8 @@ def test_what_is_complete_when_it_is_stopped_is_kept(
         ("--gui --log", "--gui is only to be looked at: no --log"),
         ("--set gravity=0", "unknown configuration key 'gravity'"),
         ("--set cone=round", "'cone' must be one of elliptic, pyramidal"),
+        ("--set timestep=0", "'timestep' must be above 0, not 0"),
+        ("--set armature=-0.1", "'armature' must be at least 0, not -0.1"),
         ("--set timestep=0.003", "'timestep' must divide the joint control's step"),
         ("--armature nan", "'armature' must be"),
         ("--export {0}/old", "an interface of version 1, this package reads "),

@@ -30,6 +30,7 @@ from tdgc.errors import InputError
 from tdgc.files import atomic
 from tdgc.parallel.cores import workers_flag
 from tdgc.show import plots
+from tdgc.sim.terrain import EDITION, family_number, is_map
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
 
@@ -87,6 +88,16 @@ def choose_seeds(text: str) -> list[int]:
         raise InputError(f"cannot read --seeds '{text}'; write e.g. 42,43") from None
 
 
+def without_missing(chosen: Sequence[Variant], low: Path) -> list[Variant]:
+    """Leave out what needs an uncalibrated low policy if there is none beside ``low``."""
+    if Runner.uncalibrated(low).with_suffix(".json").is_file():
+        return list(chosen)
+    left_out = [variant.name for variant in chosen if variant.low == "uncalibrated"]
+    if left_out:
+        print(f"without {' and '.join(left_out)}: there is no '{Runner.uncalibrated(low)}'")
+    return [variant for variant in chosen if variant.low != "uncalibrated"]
+
+
 def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Trial]:
     """All trials, seed by seed; scripted policies have no seed and run once, with the first."""
     return [
@@ -97,8 +108,12 @@ def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Trial]:
     ]
 
 
-def claim(runner: Runner) -> dict[str, Any]:
+def claim(runner: Runner, tiles: Sequence[Tile]) -> dict[str, Any]:
     """What all trials in the folder have in common, recorded there by the first call.
+
+    Args:
+        runner: of the trials.
+        tiles: that each trial is evaluated on.
 
     Raises:
         InputError: the folder holds trials that cannot be compared with these, or the low policy
@@ -115,11 +130,14 @@ def claim(runner: Runner) -> dict[str, Any]:
         "steps": runner.steps,
         "levels": runner.levels,
         "episodes": runner.episodes,
+        "edition": EDITION,
+        "maps": {family: family_number(family) for family, *_ in tiles if is_map(family)},
     }
     path = runner.out / "settings.json"
     if not path.is_file():
         runner.out.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(common, indent=2), encoding="utf-8")
+        with atomic(path) as partial:
+            partial.write_text(json.dumps(common, indent=2), encoding="utf-8")
         return common
     before = read_json(path)
     if not isinstance(before, dict):
@@ -160,16 +178,25 @@ def conduct(
     """Run ``trials`` one after the other, and write a report after each.
 
     Returns:
-        The results of the trials that were run, and whether all were run: False after a signal or
-        at the time limit.
+        The results of the trials that were run, now or before, and of ``full`` with their seeds;
+        and whether all were run: False after a signal or at the time limit.
     """
-    found: dict[Trial, Found] = {}
+
+    def result(trial: Trial) -> Found:
+        try:
+            return runner.run(trial)
+        except TrialError as error:
+            return str(error)
+
+    whole = variants(runner.alone)[0]
+    known = [*trials, *(Trial(whole, trial.seed) for trial in trials if trial.seed is not None)]
+    found = {trial: result(trial) for trial in dict.fromkeys(known) if runner.done(trial)}
     for trial in trials:
+        if trial in found:
+            continue
         print(f"{trial.name}: {trial.variant.what}", flush=True)
         try:
-            found[trial] = runner.run(trial)
-        except TrialError as error:
-            found[trial] = str(error)
+            found[trial] = result(trial)
         except StoppedError:
             return found, False
         report(runner.out, common, tiles, trials, found)
@@ -187,7 +214,10 @@ def main(arguments: list[str] | None = None) -> int:
         chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
         for variant in chosen:  # invalid settings fail now, not after hours of training
             with_overrides(HighTrainConfig(), runner.training_settings(variant))
-        tiles, common = runner.tiles(), claim(runner)
+        if args.only is None:
+            chosen = without_missing(chosen, args.low)
+        tiles = runner.tiles()
+        common = claim(runner, tiles)
     except (ValueError, OSError) as error:
         print(f"tdgc.ablate: {error}", file=sys.stderr)
         return 2

@@ -108,7 +108,7 @@ class Runner:
         """
         folder = self.out / trial.name
         try:
-            if not (folder / "cell.json").is_file():
+            if not self.done(trial):
                 self._complete(trial, folder)
             facts = read_json(folder / "cell.json")
             kept = FACTS if trial.variant.settings is not None else ()
@@ -123,6 +123,15 @@ class Runner:
         except Exception as error:  # whatever happened, the other trials continue
             said = " ".join(str(error).split())
             raise TrialError(f"{type(error).__name__}: {said}") from error
+
+    def done(self, trial: Trial) -> bool:
+        """Whether an earlier call has finished the trial."""
+        return (self.out / trial.name / "cell.json").is_file()
+
+    @staticmethod
+    def uncalibrated(low: Path) -> Path:
+        """Where train_low.py leaves the uncalibrated policy of its policy ``low``."""
+        return low.with_name("uncalibrated")
 
     def _complete(self, trial: Trial, folder: Path) -> None:
         """Do the remaining work of a trial and write its ``cell.json``."""
@@ -263,7 +272,7 @@ def changed_pair(
         OSError: a copy cannot be written.
     """
     if variant.low == "uncalibrated":
-        low = low.with_name("uncalibrated")  # where train_low.py leaves it
+        low = Runner.uncalibrated(low)
         policies.load(low)
     elif variant.low == "fixed-pose":
         pose = {"robot": {"commanded_pose": False}}

@@ -26,7 +26,7 @@ from tdgc.benchmark.evaluation import Episode, EpisodeRecord, tile_of
 from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
 from tdgc.files import atomic
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import GOAL_BEGIN, MAX_LEVEL, START_END, TILE_SIZE, ZONE, Tile
+from tdgc.sim.terrain import CELL, GOAL_BEGIN, MAX_LEVEL, START_END, TILE_SIZE, ZONE, Tile, is_map
 
 LAYERS = ("decisions", "execution", "terrain")
 
@@ -40,6 +40,9 @@ SETTLE = 1.0  # s at the start that are not judged: speeding up from rest, as in
 #: centre was up to 0.25 m from a pillar's edge when the trunk hit it, and up to 0.29 m when the
 #: robot was held up by a pillar.
 REACH = 0.2
+# m: on a user's map, ground that is this much higher than that under the trunk is an obstacle. No
+# step or block of the benchmark's families is as high.
+_TALL = 0.3
 
 
 #: What the log of a real robot may lack, with a trace column that is empty if it does.
@@ -157,6 +160,7 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
     # robot did not hit the ground.
     tripped = trace.outcome == "collided" and tile is not None and not held[-1]
     down = trace.outcome == "fell" or tripped
+    obstacle = "an obstacle" if tile is None or is_map(trace.family) else "a pillar"
     if trace.family == "mixed" or trace.level > MAX_LEVEL:
         blamed = "terrain", "never trained on"
     elif towards < -AWAY:
@@ -170,11 +174,11 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
     elif down:
         blamed = "decisions", "lost its footing on the way elsewhere"
     elif trace.outcome == "collided":
-        blamed = "decisions", f"steered into {'an obstacle' if tile is None else 'a pillar'}"
+        blamed = "decisions", f"steered into {obstacle}"
     elif trace.outcome == "left_tile":
         blamed = "decisions", "steered off the tile"
     elif held[-1]:
-        blamed = "decisions", "held up by a pillar"
+        blamed = "decisions", f"held up by {obstacle}"
     else:
         blamed = "decisions", "found no way to the goal"
     return blamed, _evidence(trace, intervals, errors, limits, towards)
@@ -238,17 +242,20 @@ def has_looked(trace: Trace) -> bool:
 
 
 def held_up(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
-    """Mask of the rows, (n,), in which a pillar is near enough to hold up the robot."""
+    """Mask of the rows, (n,), in which a pillar, or an obstacle on a map, is near enough to hold up
+    the robot."""
     x, y = trace["base_x"], trace["base_y"]
     if tile is None:
         return np.zeros(len(x), dtype=bool)
+    if is_map(trace.family):
+        return to_obstacles(tile, x, y) < hips + REACH
     return np.asarray(to_pillars(tile, x, y).min(axis=1, initial=np.inf) < hips + REACH)
 
 
 def free(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
     """Mask of the intervals, (n - 1,), in which tracking is judged.
 
-    Against a pillar or over the edge of the tile no policy can track its commands.
+    Against an obstacle or over the edge of the tile no policy can track its commands.
     """
     return ~(held_up(trace, tile, hips) | near_edge(trace, hips))[1:]
 
@@ -327,6 +334,20 @@ def to_pillars(tile: Tile, x: ArrayLike, y: ArrayLike) -> Array:
     px, py, diameter = tile.features.pillars.T
     away = np.hypot(np.asarray(x)[..., None] - px, np.asarray(y)[..., None] - py)
     return np.asarray(np.maximum(away - 0.5 * diameter, 0.0))
+
+
+def to_obstacles(tile: Tile, x: Array, y: Array) -> Array:
+    """Distances in m from points (n,) to the nearest ground that is ``_TALL`` higher than at the
+    point itself; infinite where there is none."""
+    side = CELL * np.arange(len(tile.heights))
+    under = tile.heights[
+        tuple(np.clip(np.rint(np.array([x, y]) / CELL), 0, len(side) - 1).astype(int))
+    ]
+    away = np.full(len(x), np.inf)
+    for k, height in enumerate(under):
+        i, j = np.nonzero(tile.heights > height + _TALL)
+        away[k] = np.hypot(side[i] - x[k], side[j] - y[k]).min(initial=np.inf)
+    return away
 
 
 # ---------------------------------------------------------------------------- results

@@ -38,7 +38,7 @@ class Driver(ABC):
         config: the MDP of its decisions, with cues "none" if it uses no cues.
         bounds: ranges that its commands stay within.
         action: (M, 13) raw policy output of the last decision; None if the driver decodes none.
-        told: family reported by the semantic cue; None if the driver does not use that cue.
+        told: family that the driver is told; None if it uses no such cue.
         probes: (M, 32) m, heights used by the last decision; None if the driver uses none.
     """
 
@@ -120,7 +120,8 @@ class BaselineDriver(Driver):
 
 
 class TeacherDriver(Driver):
-    """Drives robots by the scripted teacher, which decides as often as the hierarchy.
+    """Drives robots by the scripted teacher, which decides every ``decimation`` control steps by
+    default.
 
     It is told what the hierarchy has to infer, so it is no competitor: it shows what the low policy
     can do under good commands.
@@ -136,7 +137,7 @@ class TeacherDriver(Driver):
         self.bounds = config.commands
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
-        self._loco, self._goal = loco, goal
+        self._loco, self._goal, self.told = loco, goal, family
         assert loco.world.field is not None  # episodes run on tiles
         families = [family] * loco.num_robots
         self._teacher = Teacher(loco.world.field, families, self.bounds, self._landing)

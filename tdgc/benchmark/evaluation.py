@@ -7,6 +7,7 @@ batches.
 
 import dataclasses
 import itertools
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -175,7 +176,8 @@ def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
     """
     physics, control_dt = PhysicsConfig(), config.physics.control_dt
     if condition.physics_hz is None:
-        substeps = round(control_dt / physics.dt)
+        held = physics.hold * physics.dt  # s; a shorter step where it does not divide the control's
+        substeps = physics.hold * math.ceil(control_dt / held - 1e-6)
         return dataclasses.replace(physics, control_dt=control_dt, substeps=substeps)
     substeps = round(control_dt * condition.physics_hz)
     # Torque is updated at each physics step, as by a motor driver at that rate.

@@ -193,10 +193,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         low, low_config = load_low(args.low)
         pair = load_high(args.high, low, low_config)
+        hips = float(read_geometry(low_config.robot).hips[0, 0])
     except (ValueError, OSError) as error:
         print(f"tdgc.benchmark.planted: {error}", file=sys.stderr)
         return 2
-    hips = float(read_geometry(low_config.robot).hips[0, 0])
     print("fault".ljust(38) + "layer".ljust(11) + "".join(f"{name:>9}" for name in FAMILIES))
     right = total = 0
     for fault in FAULTS:

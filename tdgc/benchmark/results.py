@@ -11,6 +11,7 @@ import numpy as np
 
 from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
+from tdgc.errors import InputError
 from tdgc.files import atomic
 from tdgc.parallel.worker import WorkerError
 from tdgc.sim.terrain import EDITION
@@ -223,7 +224,8 @@ def salvage(
     cells: Sequence[Cell],
     editions: Mapping[str, int] | None = None,
 ) -> Iterator[None]:
-    """Context for running episodes that keeps what is ``complete`` if one of ``STOPS`` occurs.
+    """Context for running episodes that keeps what is ``complete`` if one of ``STOPS`` occurs, or
+    if a robot or a terrain file cannot be used where the episodes run.
 
     It then writes and prints the table of those episodes, adds a note with their number to the
     exception, and re-raises it.
@@ -235,7 +237,7 @@ def salvage(
     """
     try:
         yield
-    except STOPS as error:
+    except (*STOPS, InputError) as error:
         done, total = complete(episodes, cells), sum(cell.count for cell in cells)
         if done:
             print(describe(write_results(folder, done, editions)))

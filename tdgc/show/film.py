@@ -289,10 +289,10 @@ def film(recording: Recording, folder: Path, mp4: bool = True) -> None:
         InputError: ``mp4`` without PyAV.
         OSError: a file cannot be written.
     """
-    stem = folder / f"film_{recording.name}"
+    name = f"film_{recording.name}"  # may contain dots
     rate = 1 / Fraction(recording.dt * _frame_steps(recording)).limit_denominator(1000)
     small: list[Image.Image] = []
-    with _mp4(stem.with_suffix(".mp4"), rate) if mp4 else contextlib.nullcontext() as add:
+    with _mp4(folder / f"{name}.mp4", rate) if mp4 else contextlib.nullcontext() as add:
         for k, frame in enumerate(frames(recording)):
             if add is not None:
                 add(frame)
@@ -302,7 +302,7 @@ def film(recording: Recording, folder: Path, mp4: bool = True) -> None:
                 # The one of Pillow's methods that preserves the robot's orange, in half the bytes.
                 method = Image.Quantize.FASTOCTREE
                 small.append(reduced.quantize(method=method, dither=Image.Dither.NONE))
-    with atomic(stem.with_suffix(".gif")) as partial:
+    with atomic(folder / f"{name}.gif") as partial:
         small[0].save(
             partial,
             format="GIF",

@@ -7,6 +7,7 @@ knows nothing about rewards or tasks: ``tdgc.tasks.low_env`` trains the low poli
 """
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +37,13 @@ from tdgc.state import State, copies, fill
 SPEED_SCALE = 0.05  # s/rad, scale of joint speeds in the observation (Walk These Ways)
 GYRO_SCALE = 0.25  # s/rad, scale of angular velocity in the observation
 _FREQUENCY = INDEX["frequency"]
-_HISTORY = 3  # control steps of targets kept: the current and two before, for latency up to 40 ms
+_LATENCY = 0.04  # s, the longest: real robots have about 0.03
 
 
 def check_randomisation(
     config: RandomisationConfig, physics: PhysicsConfig, trunk_mass: float
 ) -> None:
-    """Check that the ranges are physical, and latencies no longer than joint targets are kept.
+    """Check that the ranges are physical, and latencies no longer than joint targets are kept for.
 
     Args:
         config: the ranges and their ``scale``.
@@ -52,12 +53,12 @@ def check_randomisation(
     Raises:
         ConfigError: a range outside what is allowed; the message names the limits.
     """
-    kept, any_more = (_HISTORY - 1) * physics.control_dt, float("inf")
+    any_more = float("inf")
     allowed = {  # nominal, least and greatest value
         "friction": (physics.friction, 0.0, any_more),
         "payload": (0.0, -0.9 * trunk_mass, any_more),  # leave some mass for Bullet
         "motor_strength": (1.0, 0.0, any_more),
-        "latency": (0.0, 0.0, kept),
+        "latency": (0.0, 0.0, _LATENCY),
         "armature": (0.0, 0.0, any_more),
         "joint_friction": (0.0, 0.0, any_more),
     }
@@ -78,7 +79,8 @@ class Locomotion:
     Attributes:
         command: (M, 15), to be set by the caller.
         actions: (2, M, 12), the last clipped action and the one before.
-        targets: (3, M, 12) rad, joint targets of the last control step and the two before.
+        targets: (H, M, 12) rad, joint targets of the last control step and those before, as far
+            back as latency reaches; 3 by default.
         carried_out: (M, 15), ``executed`` commands of the last control step.
         frequency_limit: Hz, cap on the robot's ``start_frequency``.
         layout: terms of the observation.
@@ -110,7 +112,9 @@ class Locomotion:
         self.carried_out = self.command.copy()
         self.frequency_limit = np.inf
         self.actions = np.zeros((2, num_robots, NUM_JOINTS))
-        self.targets = np.tile(self.nominal, (_HISTORY, num_robots, 1))
+        # The rewards look two steps back.
+        kept = max(3, 1 + math.ceil(_LATENCY / physics.control_dt - 1e-6))
+        self.targets = np.tile(self.nominal, (kept, num_robots, 1))
         self.delay = np.zeros(num_robots)
         self.joint_offset = np.zeros((num_robots, NUM_JOINTS))
         self.friction = np.full(num_robots, physics.friction)

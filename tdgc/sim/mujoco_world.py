@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
+from tdgc.config.settings import NotNegative, Positive
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import GRAVITY, Array, RobotState, pd_torque, rotation_matrix
@@ -35,16 +36,16 @@ _GROUND, _TRUNK, _FOOT, _LEG = -1, 0, 1, 5
 class MujocoConfig:
     """MuJoCo's settings; docs/mujoco.md gives the reason for each."""
 
-    timestep: float = 0.0025  # s, Bullet's on terrain
+    timestep: Positive = 0.0025  # s, Bullet's on terrain
     # s, time constant of contacts and joint limits. At MuJoCo's default of 0.02 s feet sink 3-4 cm
     # into the ground, past their centres, and stay there.
-    solref: float = 0.005
+    solref: Positive = 0.005
     # With pyramidal cones and MuJoCo's default impratio of 1, feet creep down slopes.
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
-    impratio: float = 100.0
-    friction: float = 0.8  # foot on ground, nominal (benchmark)
-    armature: float = 0.01  # kg m^2, rotor inertia of each joint, as in models of such robots
-    joint_friction: float = 0.0  # N m, dry friction of each joint
+    impratio: Positive = 100.0
+    friction: NotNegative = 0.8  # foot on ground, nominal (benchmark)
+    armature: NotNegative = 0.01  # kg m^2, rotor inertia of each joint, as in models of such robots
+    joint_friction: NotNegative = 0.0  # N m, dry friction of each joint
 
     def physics(self, control_dt: float, joint_rate: float) -> PhysicsConfig:
         """Time steps of control, joint control and physics.
@@ -205,7 +206,9 @@ def _with_visuals(urdf: Path) -> mujoco.MjSpec:
                 link.remove(shape)
     compiler = ElementTree.SubElement(ElementTree.SubElement(tree, "mujoco"), "compiler")
     compiler.set("discardvisual", "false")
-    return mujoco.MjSpec.from_string(ElementTree.tostring(tree, encoding="unicode"))
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(tree, encoding="unicode"))
+    spec.modelfiledir = str(urdf.resolve().parent)  # where collision meshes are looked for
+    return spec
 
 
 def _add_ground(spec: mujoco.MjSpec, field: TileField) -> None:

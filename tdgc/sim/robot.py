@@ -79,12 +79,13 @@ def fitted(config: RobotConfig) -> dict[str, Any]:
 def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swing: Array) -> Array:
     """q0(c, phi): the nominal pose adapted to the commands, (M, 15), (M, 4) -> (M, 12) rad.
 
-    The feet are under a level trunk at the commanded height, with the commanded stance width and
-    length. They rise along ``swing``, the profile of ``gaits.swing_profile``, by the amount that
-    the commanded swing height exceeds its default. At default commands this is the paper's q0. With
-    the paper's q0 throughout, a policy hardly learned to follow these commands, but it did learn
-    pitch and roll (docs/experiments.md). The pose is the offset of the actions, not a constraint: a
-    foot out of reach gets the nearest angles within the calf's limits, and no foot is higher than
+    The feet are under a level trunk at the commanded height. From their nominal places they move
+    apart by as much as stance width and length exceed their defaults. They rise along ``swing``,
+    the profile of ``gaits.swing_profile``, by the amount that the commanded swing height exceeds
+    its default. At default commands this is the paper's q0. With the paper's q0 throughout, a
+    policy hardly learned to follow these commands, but it did learn pitch and roll
+    (docs/experiments.md). The pose is the offset of the actions, not a constraint: a foot out of
+    reach gets the nearest angles within the calf's limits, and no foot is higher than
     ``HIGHEST_FOOT``.
     """
     standing, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
@@ -124,8 +125,8 @@ def walking_pose(
 ) -> Array:
     """q0(c, phi) of a robot that walks as commanded, (M, 12) rad.
 
-    The feet are under a trunk at the commanded height, pitch and roll, with the commanded stance
-    width and length. They move between Raibert's footholds and rise to the commanded height in
+    The feet are under a trunk at the commanded height, pitch and roll, as far apart as in
+    ``commanded_pose``. They move between Raibert's footholds and rise to the commanded height in
     swing. On top of that, the joints are offset by the position error that the joint control needs
     to carry the load of the stance feet (``stance_load``). The pose is the offset of the actions,
     not a constraint, see ``commanded_pose``.

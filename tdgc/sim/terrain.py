@@ -24,6 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tdgc.errors import InputError
+
 FloatArray = NDArray[np.float64]
 HeightArray = NDArray[np.float32]
 
@@ -493,19 +495,19 @@ def height_map(path: str) -> FloatArray:
     Only the zone and its transition bands use them; the platforms are flat.
 
     Raises:
-        ValueError: the file is missing or does not hold such heights.
+        InputError: the file is missing or does not hold such heights.
     """
     try:
         heights = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise ValueError(f"terrain '{path}' cannot be read as a NumPy file: {error}") from error
+        raise InputError(f"terrain '{path}' cannot be read as a NumPy file: {error}") from error
     shape = (TILE_SAMPLES, TILE_SAMPLES)
     real = isinstance(heights, np.ndarray) and heights.dtype.kind in "fiu"
     if not real or heights.shape != shape or not np.isfinite(heights).all():
-        raise ValueError(f"terrain '{path}' must hold finite heights in m, an array {shape}")
+        raise InputError(f"terrain '{path}' must hold finite heights in m, an array {shape}")
     limit = HEIGHT_RANGE[1] / MAX_DIFFICULTY
     if np.abs(heights).max() > limit:
-        raise ValueError(f"terrain '{path}' must stay within {limit:g} m of the platforms' height")
+        raise InputError(f"terrain '{path}' must stay within {limit:g} m of the platforms' height")
     return heights.astype(np.float64)
 
 
