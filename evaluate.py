@@ -455,8 +455,8 @@ def main(arguments: list[str] | None = None) -> int:
             problems = run_table(evaluation, low, drivers, trained_on)
         else:
             run_window(evaluation, low, drivers)
-    except (InputError, WindowError) as error:  # Bullet cannot load the robot or open its window
-        fail(error)
+    except (InputError, WindowError) as error:  # no robot, terrain or window where it is needed
+        fail(what_stopped(error))
         return 2
     except STOPS as error:
         fail(what_stopped(error))

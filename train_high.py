@@ -19,7 +19,15 @@ import torch as th
 from tqdm import tqdm
 
 from tdgc import __version__, policies
-from tdgc.config import NO_TEACHER, PRESETS, ConfigError, HighTrainConfig, to_dict, with_overrides
+from tdgc.config import (
+    NO_TEACHER,
+    PRESETS,
+    ConfigError,
+    HighLevelConfig,
+    HighTrainConfig,
+    to_dict,
+    with_overrides,
+)
 from tdgc.files import checksum
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
@@ -36,7 +44,7 @@ from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import check_randomisation
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import EDITION
+from tdgc.sim.terrain import EDITION, TRENCHED
 from tdgc.sim.world import check_robot
 from tdgc.tasks.curriculum import check_rules
 from tdgc.tasks.high_env import NavigationTask
@@ -50,7 +58,6 @@ from tdgc.tasks.tiles import check_families, check_levels
 # Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
 # the apprentice alone drives, so that it learns in the states to which its own actions lead.
 _LED = 0.75
-_TRENCHED = {"gap", "ditches", "mixed"}  # families with trenches, over which the teacher leaps
 #: Where train_low.py writes its policy by default.
 TRAINED_LOW = Path("runs/low/policy")
 
@@ -117,7 +124,7 @@ def make_env(
 ) -> TaskVecEnv:
     """Start the workers; ``taught`` and ``led`` as in ``NavigationTask``."""
     env_config, landing = config.env, None
-    if taught and not _TRENCHED.isdisjoint(env_config.families):
+    if taught and not set(TRENCHED).isdisjoint(env_config.families):
         landing = measure_landing(*load_low(low))
         if landing is None:
             tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
@@ -183,10 +190,8 @@ def build_imitation(
     mdp = dataclasses.replace(
         config.env, curriculum=imitation.curriculum, first_level=0, first_levels=config.env.levels
     )
-    shown, led = (
-        dataclasses.replace(config, env=mdp),
-        _LED * (min(imitation.steps, config.steps) // config.n_envs),
-    )
+    led = _LED * (min(imitation.steps, config.steps) // config.n_envs)
+    shown = dataclasses.replace(config, env=mdp)
     env = make_env(shown, low, True, led, timeout, link)
     model = make_learner(
         Apprentice, ApprenticePolicy, env, config, device,
@@ -254,10 +259,11 @@ def check(config: HighTrainConfig) -> None:
             f"'env.first_level' and 'env.first_levels' must leave robots on the {env.levels} "
             f"levels, not on {env.first_levels} from {env.first_level} up"
         )
-    if config.imitation.steps and (env.first_level, env.first_levels) != (0, 1):
+    first = HighLevelConfig.first_level, HighLevelConfig.first_levels
+    if config.imitation.steps and (env.first_level, env.first_levels) != first:
         raise ConfigError(
-            "'env.first_level' and 'env.first_levels' have no effect with imitation, which begins "
-            "on all levels; set imitation.steps to 0, or leave them"
+            "'env.first_level' and 'env.first_levels' have no effect with imitation, which has its "
+            "own levels; set imitation.steps to 0, or leave them"
         )
     parts = {"ppo": ppo.minibatches}
     if config.imitation.steps:

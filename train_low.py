@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch as th
@@ -66,19 +66,6 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
     return [Phase("learning to walk", make, config.steps)]
 
 
-def leaves(key: str, value: str) -> Iterator[str]:
-    """Yield the dotted keys that ``--set key=value`` assigns; the value may be a JSON table."""
-    try:
-        table = json.loads(value)
-    except ValueError:
-        table = None
-    if isinstance(table, dict):
-        for name, own in table.items():
-            yield from leaves(f"{key}.{name}", json.dumps(own))
-    else:
-        yield key
-
-
 def check(config: LowTrainConfig) -> None:
     """Refuse settings that would fail later or have no effect.
 
@@ -109,17 +96,13 @@ def fit(config: LowTrainConfig, assignments: Sequence[str]) -> LowTrainConfig:
     """
     if config.env.robot.urdf == RobotConfig().urdf:
         return config
-    assigned: set[str] = set()
-    for text in assignments:
-        key, _, value = text.partition("=")
-        assigned |= set(leaves(key.strip(), value))
-    found = [
-        f"env.robot.{name}={json.dumps(value)}"
-        for name, value in fitted(config.env.robot).items()
-        if f"env.robot.{name}" not in assigned
-    ]
-    tqdm.write(f"from {config.env.robot.urdf}: {' '.join(found)}")
-    return with_overrides(config, found)
+    found = fitted(config.env.robot)
+    fits = [f"env.robot.{name}={json.dumps(value)}" for name, value in found.items()]
+    config = with_overrides(config, [*fits, *assignments])
+    values = {name: json.dumps(getattr(config.env.robot, name)) for name in found}
+    listed = " ".join(f"env.robot.{name}={value}" for name, value in values.items())
+    tqdm.write(f"from {config.env.robot.urdf}: {listed}")
+    return config
 
 
 class StoppedError(Exception):
@@ -133,6 +116,7 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
     run is resumed, with the same result. Without calibration the policy is only marked as final.
 
     Raises:
+        ConfigError: the robots fall too often to be calibrated.
         WorkerError: a worker failed.
     """
     learned = policies.load(out / "policy")

@@ -51,6 +51,7 @@ Correction = Callable[[Array], Array]
 
 #: Fewer robots whose walking is measured say nothing about the commands.
 LEAST_ROBOTS = 64
+_LEAST_WALKED = 8  # of them: one is held out to measure the networks' error
 _STREAM = 3  # of random numbers; training and evaluation have others (``tdgc.sim.terrain``)
 _BATCH = 400  # robots that walk at the same time
 _WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2  # the mean is over the rest
@@ -333,7 +334,7 @@ def calibrate(
         The student, and facts about its calibration, whose keys include the units.
 
     Raises:
-        ConfigError: most robots fell.
+        ConfigError: fewer than ``_LEAST_WALKED`` robots walked without a fall.
         WorkerError: a worker failed.
     """
     config = load_low(low)[1]
@@ -345,10 +346,10 @@ def calibrate(
         walks.append(walk)
         tick(_WALKING * len(walks) / len(jobs))
     given, reached = (np.concatenate(parts) for parts in zip(*walks, strict=True))
-    if 8 * len(given) < LEAST_ROBOTS:
+    if len(given) < _LEAST_WALKED:
         raise ConfigError(
-            f"only {len(given)} of {robots} robots walked without a fall: this policy cannot be "
-            "calibrated"
+            f"only {len(given)} of {robots} robots walked without a fall, which is too few to "
+            "calibrate; calibration.robots=0 leaves the policy as it is"
         )
     response = ResponseModel(given, reached, config.commands, seed)
     correct = Corrector(response, seed)

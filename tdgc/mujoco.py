@@ -302,8 +302,8 @@ def main(arguments: list[str] | None = None) -> int:
             show(args, config)
         else:
             problems = run_table(args, config)
-    except (ValueError, WindowError) as error:  # MuJoCo cannot load the robot or open a window
-        fail(error)
+    except (ValueError, WindowError) as error:  # no robot, terrain or window where it is needed
+        fail(what_stopped(error))
         return 2
     except STOPS as error:
         problems = [what_stopped(error)]

@@ -251,6 +251,10 @@ def test_an_obstacle_of_a_map_is_the_decisions_fault(tmp_path):
     assert verdict(pushing) == ("decisions", "held up by an obstacle")
     away = walk(path, 10, "timeout", track=((0.8, 4.0), (1.0, 4.0)), error_vx=-0.5)
     assert verdict(away) == ("execution", "lost track of velocity")
+    stairs = str(tmp_path / "stairs.npy")  # two steps of 16 cm, with a tread of 25 cm
+    np.save(stairs, np.repeat([0.0, 0.16, 0.32], [80, 5, 76])[:, None] * np.ones(161))
+    climbing = walk(stairs, 10, "collided", track=into)
+    assert verdict(climbing) == ("execution", "lost its footing on the way to the goal")
     tripped = walk(path, 10, "collided", track=((0.8, 4.0), (2.5, 4.0)))
     assert verdict(tripped) == ("execution", "lost its footing on the way to the goal")
 

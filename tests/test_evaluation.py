@@ -34,6 +34,7 @@ from tdgc.benchmark.trace import Selection
 from tdgc.benchmark.tracking import track_gait
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, RandomisationConfig
+from tdgc.errors import InputError
 from tdgc.parallel.worker import WorkerError
 from tdgc.show import gui
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
@@ -468,7 +469,7 @@ BLOWN = "Cell(...): a robot's position is not finite"
         (KeyboardInterrupt(), "stopped by Ctrl-C"),
         (WorkerError(DIED), DIED),
         (FloatingPointError(BLOWN), BLOWN),
-        (FloatingPointError(f"Traceback\n  of a cluster\n{BLOWN}"), BLOWN),
+        (InputError("terrain 'no.npy' cannot be read"), "terrain 'no.npy' cannot be read"),
         (OSError(errno.ENOSPC, "No space left on device"), "[Errno 28] No space left on device"),
     ],
 )
@@ -477,7 +478,8 @@ def test_what_is_complete_is_kept(error, reason, high, tmp_path, monkeypatch, ca
     monkeypatch.setattr(evaluation, "BATCH", 1)
     monkeypatch.setattr(evaluation, "HORIZON", 0.04)
     monkeypatch.setattr(evaluate, "run_jobs", stopped(7, error))
-    assert answer([*FOUR, "--high", str(high), "--out", str(tmp_path)]) == 1
+    status = 2 if isinstance(error, InputError) else 1
+    assert answer([*FOUR, "--high", str(high), "--out", str(tmp_path)]) == status
     said = capsys.readouterr()
     lines = [line for line in said.err.splitlines() if line.startswith("evaluate.py")]
     assert lines == [f"evaluate.py: {reason}; the table has 6 of 8 episodes"]

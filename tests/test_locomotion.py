@@ -454,8 +454,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
 
 
 def test_latency_is_kept_at_a_faster_control_rate() -> None:
-    """At 100 Hz, a target takes effect three steps after the action, as does one of 50 Hz that is
-    30 ms late after one and a half."""
+    """30 ms are three control steps at 100 Hz, longer than the history at 50 Hz."""
     physics = PhysicsConfig(control_dt=0.01, substeps=4)
     loco = Locomotion(1, RobotConfig(), physics, None)
     assert loco.targets.shape == (5, 1, 12)

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from tdgc.ablate.table import Found, describe, rows
-from tdgc.ablate.trials import Runner, StoppedError, Tile, Trial, TrialError
+from tdgc.ablate.trials import Runner, StoppedError, Tile, Trial, TrialError, uncalibrated
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
@@ -90,11 +90,11 @@ def choose_seeds(text: str) -> list[int]:
 
 def without_missing(chosen: Sequence[Variant], low: Path) -> list[Variant]:
     """Leave out what needs an uncalibrated low policy if there is none beside ``low``."""
-    if Runner.uncalibrated(low).with_suffix(".json").is_file():
+    if uncalibrated(low).with_suffix(".json").is_file():
         return list(chosen)
     left_out = [variant.name for variant in chosen if variant.low == "uncalibrated"]
     if left_out:
-        print(f"without {' and '.join(left_out)}: there is no '{Runner.uncalibrated(low)}'")
+        print(f"without {' and '.join(left_out)}: there is no '{uncalibrated(low)}'")
     return [variant for variant in chosen if variant.low != "uncalibrated"]
 
 
@@ -230,7 +230,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     if not finished:
         print("stopped; run the same command to continue")
-    failed = {trial.name: message for trial, message in found.items() if isinstance(message, str)}
+    asked = {trial.name: found.get(trial) for trial in trials}
+    failed = {name: message for name, message in asked.items() if isinstance(message, str)}
     for name, message in failed.items():
         print(f"tdgc.ablate: {name}: {message}", file=sys.stderr)
     return 1 if failed else 0

@@ -128,11 +128,6 @@ class Runner:
         """Whether an earlier call has finished the trial."""
         return (self.out / trial.name / "cell.json").is_file()
 
-    @staticmethod
-    def uncalibrated(low: Path) -> Path:
-        """Where train_low.py leaves the uncalibrated policy of its policy ``low``."""
-        return low.with_name("uncalibrated")
-
     def _complete(self, trial: Trial, folder: Path) -> None:
         """Do the remaining work of a trial and write its ``cell.json``."""
         high = None
@@ -260,6 +255,11 @@ def _own_signals() -> Iterator[None]:
 # ---------------------------------------------------------------------------- policies
 
 
+def uncalibrated(low: Path) -> Path:
+    """Where train_low.py leaves the uncalibrated policy of its policy ``low``."""
+    return low.with_name("uncalibrated")
+
+
 def changed_pair(
     variant: Variant, low: Path, high: Path | None, folder: Path
 ) -> tuple[Path, Path | None]:
@@ -272,7 +272,7 @@ def changed_pair(
         OSError: a copy cannot be written.
     """
     if variant.low == "uncalibrated":
-        low = Runner.uncalibrated(low)
+        low = uncalibrated(low)
         policies.load(low)
     elif variant.low == "fixed-pose":
         pose = {"robot": {"commanded_pose": False}}

@@ -40,9 +40,10 @@ SETTLE = 1.0  # s at the start that are not judged: speeding up from rest, as in
 #: centre was up to 0.25 m from a pillar's edge when the trunk hit it, and up to 0.29 m when the
 #: robot was held up by a pillar.
 REACH = 0.2
-# m: on a user's map, ground that is this much higher than that under the trunk is an obstacle. No
-# step or block of the benchmark's families is as high.
-_TALL = 0.3
+# m: on a user's map, ground that rises by this much within ``_STEEP`` cells, to this much above the
+# ground under the trunk, is an obstacle. Steps of the benchmark are half as high at most, and
+# stairs of them take more room.
+_TALL, _STEEP = 0.3, 2
 
 
 #: What the log of a real robot may lack, with a trace column that is empty if it does.
@@ -337,17 +338,20 @@ def to_pillars(tile: Tile, x: ArrayLike, y: ArrayLike) -> Array:
 
 
 def to_obstacles(tile: Tile, x: Array, y: Array) -> Array:
-    """Distances in m from points (n,) to the nearest ground that is ``_TALL`` higher than at the
-    point itself; infinite where there is none."""
-    side = CELL * np.arange(len(tile.heights))
-    under = tile.heights[
-        tuple(np.clip(np.rint(np.array([x, y]) / CELL), 0, len(side) - 1).astype(int))
-    ]
-    away = np.full(len(x), np.inf)
-    for k, height in enumerate(under):
-        i, j = np.nonzero(tile.heights > height + _TALL)
-        away[k] = np.hypot(side[i] - x[k], side[j] - y[k]).min(initial=np.inf)
-    return away
+    """Distances in m from points (n,) to the nearest wall, see ``_TALL``, that is higher than the
+    ground at the point; infinite where there is none."""
+    heights, n = tile.heights, len(tile.heights)
+    padded = np.pad(heights, _STEEP, mode="edge")
+    shifts = range(2 * _STEEP + 1)
+    lowest = np.min([padded[i : i + n, j : j + n] for i in shifts for j in shifts], axis=0)
+    walls = np.argwhere(heights - lowest > _TALL)
+    tops = heights[tuple(walls.T)]
+    at = np.stack([x, y], axis=1)
+    under = heights[tuple(np.clip(np.rint(at / CELL), 0, n - 1).astype(int).T)]
+    away = np.linalg.norm(CELL * walls - at[:, None], axis=2)
+    return np.asarray(
+        np.where(tops > under[:, None] + _TALL, away, np.inf).min(axis=1, initial=np.inf)
+    )
 
 
 # ---------------------------------------------------------------------------- results

@@ -248,7 +248,6 @@ def salvage(
 
 
 def what_stopped(error: BaseException) -> str:
-    """Describe one of ``STOPS`` in one line, with its notes."""
-    said = str(error).rpartition("\n")[-1]  # a cluster's errors begin with a traceback
-    said = "stopped by Ctrl-C" if isinstance(error, KeyboardInterrupt) else said
+    """Describe what ended an evaluation in one line, with its notes."""
+    said = "stopped by Ctrl-C" if isinstance(error, KeyboardInterrupt) else str(error)
     return "; ".join([said, *getattr(error, "__notes__", ())])

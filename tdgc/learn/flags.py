@@ -117,7 +117,10 @@ def check_device(name: str) -> None:
         kind = "cpu" if name == "auto" else th.device(name).type
         if kind == "cuda" and not th.cuda.is_available():
             raise RuntimeError("PyTorch finds no GPU here")
-        th.zeros(1, device="cpu" if name == "auto" else name)
+        if kind not in ("cpu", "cuda"):
+            raise RuntimeError("train on cpu or cuda")
+        if name != "auto":
+            th.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"--device {name}: {str(error).splitlines()[0]}") from None
 

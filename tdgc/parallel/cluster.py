@@ -293,7 +293,7 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
             try:
                 done[running.pop(answer)] = ray.get(answer)
             except ray.exceptions.RayTaskError as error:
-                raise error.cause from None  # the job's own, without Ray's traceback
+                raise error.cause from error  # the job's own
             except ray.exceptions.RayError as error:
                 kind = type(error).__name__
                 raise WorkerError(f"a job was lost {_RERUNS + 1} times ({kind})") from error

@@ -38,6 +38,8 @@ FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
 #: the same with trenches before or behind it.
 UNNAMED = CLUTTER, DITCHES = "clutter", "ditches"
 ALL_FAMILIES = (*FAMILIES, "mixed", *UNNAMED)
+#: Families whose tiles may have trenches.
+TRENCHED = ("gap", "mixed", DITCHES)
 #: A family name with this ending is the path of a user's height map, see ``height_map``.
 MAP_ENDING = ".npy"
 MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1

@@ -146,8 +146,9 @@ class NavigationTask:
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._reached_at = np.full(m, -1)
         # Not told its family in this episode: without the semantic cue, no robot is.
-        self._semantic = config.cues in ("both", "semantic")
-        self._untold = np.full(m, not self._semantic)
+        semantic = config.cues in ("both", "semantic")
+        self._unknown_share = config.unknown_share if semantic else 1.0
+        self._untold = np.full(m, not semantic)
         self._next_push = np.zeros(m)
         disturbed = config.randomisation, self.rng, self.step_seconds
         self._pushes = Pushes(*disturbed, self._next_push)
@@ -190,8 +191,7 @@ class NavigationTask:
             width = self._width()[index]
             self.locomotion.randomise(index, self.config.randomisation, rng, width)
             self._pushes.schedule(index, self.elapsed)
-            untold = rng.uniform(size=n) < self.config.unknown_share
-            self._untold[index] = untold | (not self._semantic)
+            self._untold[index] = rng.uniform(size=n) < self._unknown_share
         self._actions[:, index] = 0.0
         middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
         self._commands[:, index] = command_share(middle, self.decoder)
@@ -293,7 +293,7 @@ class NavigationTask:
             return seen
         if np.isfinite(seen).all():
             guidance = self._guidance(self.teacher)
-        else:  # a robot has blown up, which ends all episodes (``tdgc.parallel.worker``)
+        else:  # a robot has blown up: the worker ends all of its episodes
             guidance = np.zeros((self.num_robots, GUIDANCE))
         return np.concatenate([seen, guidance], axis=1, dtype=np.float32)
 

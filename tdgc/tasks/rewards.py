@@ -37,7 +37,7 @@ class LowStep:
         base_height: (M,) m, trunk above the ground under it.
         foot_height: (M, 4) m, foot centre above the support surface under it.
         standing_height: m, to which the body height command is added.
-        targets: (3, M, 12) rad, joint targets of this step and the two before.
+        targets: (3 or more, M, 12) rad, joint targets of this step and the two before.
         actions: (2, M, 12), this action and the one before.
         acceleration: (M, 12) rad/s^2 of the joints over the step.
         last_tilt: (M, 2) x and y of gravity in the trunk's frame one gait cycle ago.

@@ -29,7 +29,7 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __init__(self, make_task: Callable[[int, bool], Any], render_mode: str | None) -> None:
         self.render_mode = render_mode
         self._make_task = make_task
-        # Without a seed, each environment is another one.
+        # So that environments made without a seed differ.
         self.task = make_task(int(np.random.SeedSequence().generate_state(1)[0]), self._rendered)
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space
