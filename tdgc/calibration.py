@@ -18,6 +18,7 @@ import itertools
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch as th
@@ -35,6 +36,7 @@ from tdgc.config import (
 )
 from tdgc.files import make_folder
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
+from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.jobs import run_jobs
 from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Actor, Policy
@@ -42,7 +44,7 @@ from tdgc.sim.commands import CONTINUOUS, NAMES, NUM_COMMANDS, SIDEWAYS, observe
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, action_scale
-from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_env import LowLevelTask, make_task
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import is_fallen
 
@@ -221,14 +223,13 @@ def training_tasks(
 ) -> list[LowLevelTask]:
     """The training MDP as late in a run: all commands, all levels, ``plane_share`` on a plane."""
     config = dataclasses.replace(config, command_start=1.0)
-    on_plane = min(round(plane_share * robots), robots - 1)
-    seeds = np.random.SeedSequence(seed).generate_state(2).tolist()
-    tiles = LowLevelTask(dataclasses.replace(config, terrain="tiles"), robots - on_plane, seeds[1])
-    tiles.level[:] = np.arange(tiles.num_robots) % config.levels
-    if not on_plane:
-        return [tiles]
-    plane = LowLevelTask(dataclasses.replace(config, terrain="plane"), on_plane, seeds[0])
-    return [plane, tiles]
+    plane, tiles = (dataclasses.replace(config, terrain=ground) for ground in ("plane", "tiles"))
+    task = make_task((plane, tiles), plane_share, robots, seed)
+    parts = task.tasks if isinstance(task, TaskGroup) else [task]
+    tasks = [cast(LowLevelTask, part) for part in parts]
+    rugged = tasks[-1]
+    rugged.level[:] = np.arange(rugged.num_robots) % config.levels
+    return tasks
 
 
 def shown(
