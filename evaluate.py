@@ -41,11 +41,9 @@ from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy, load
 from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
-from tdgc.sim.terrain import ALL_FAMILIES
 from tdgc.sim.world import WindowError
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
-from tdgc.tasks.teacher import STYLES
 
 POLICIES = ("tdgc", "gp")
 TEACHER = "teacher"
@@ -65,8 +63,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     who.add_argument(
         "--policies",
         help="all, or of tdgc (the hierarchy), gp (the scripted baseline), cues (a script on the "
-        "cues of tdgc) and teacher (the script that tdgc imitated first, which is told where "
-        "everything is); all is tdgc and gp, the default where there is a high policy, shipped or "
+        "cues of tdgc) and teacher (the script that tdgc imitated first, which knows the heights "
+        "of the tile); all is tdgc and gp, the default where there is a high policy, shipped or "
         "given by --high, and otherwise gp",
     )
     who.add_argument(
@@ -168,14 +166,6 @@ class Evaluation:
     def _check_policies(self) -> None:
         if self.tuning is not None and "tdgc" not in self.policies:
             raise ValueError("--tune and --set change tdgc, which is not among the policies")
-        met = (*self.families, *(name for name in self.conditions if name in ALL_FAMILIES))
-        strange = [name for name in met if name not in STYLES]
-        if TEACHER in self.policies and strange:
-            known = ", ".join(STYLES)
-            raise ValueError(f"the {TEACHER} knows {known}; it cannot lead on {strange[0]}")
-        hidden = [name for name in self.conditions if not CONDITIONS[name].told]
-        if TEACHER in self.policies and hidden:
-            raise ValueError(f"the {TEACHER} is told the family; it cannot lead in {hidden[0]}")
 
     @classmethod
     def of(cls, flags: argparse.Namespace) -> "Evaluation":

@@ -44,7 +44,7 @@ from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import check_randomisation
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import EDITION, TRENCHED
+from tdgc.sim.terrain import EDITION, may_have_trenches
 from tdgc.sim.world import check_robot
 from tdgc.tasks.curriculum import check_rules
 from tdgc.tasks.high_env import NavigationTask
@@ -52,7 +52,6 @@ from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
-from tdgc.tasks.teacher import STYLES
 from tdgc.tasks.tiles import check_families, check_levels
 
 # Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
@@ -124,7 +123,7 @@ def make_env(
 ) -> TaskVecEnv:
     """Start the workers; ``taught`` and ``led`` as in ``NavigationTask``."""
     env_config, landing = config.env, None
-    if taught and not set(TRENCHED).isdisjoint(env_config.families):
+    if taught and any(map(may_have_trenches, env_config.families)):
         landing = measure_landing(*load_low(low))
         if landing is None:
             tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
@@ -321,10 +320,6 @@ def main(arguments: list[str] | None = None) -> int:
         check_randomisation(config.env.randomisation, low_config.physics, trunk)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check(config)
-        if config.imitation.steps:
-            for family in dict.fromkeys(config.env.families):
-                if family not in STYLES:
-                    tqdm.write(f"the teacher knows no style for {family} and walks straight on")
         meta: dict[str, Any] = {
             "config": to_dict(config.env),
             "low": {"config": to_dict(low_config), "observation": low.actor_dim},

@@ -1,6 +1,8 @@
-"""The scripted teacher: what it sees of a tile, and what it commands there."""
+"""The scripted teacher: what it commands on which ground."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,41 +10,45 @@ import pytest
 from tdgc.config import CommandRanges, PhysicsConfig, RobotConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.terrain import Features, TileField, make_tile
+from tdgc.sim.terrain import CELL, Tile, TileField, make_tile
 from tdgc.tasks.leaps import SWING_HEIGHT, Landing
-from tdgc.tasks.teacher import SIGHT, STYLES, UNEVEN, WAY, Teacher, travel_cost
+from tdgc.tasks.teacher import LEAPING, SIGHT, SLOPING, UNEVEN, WAY, Teacher
+
+Heights = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def test_travel_cost_in_the_open_is_the_way_of_a_king() -> None:
-    goal = np.array([7.0, 4.0])
-    cost, step, left = travel_cost(np.empty((0, 3)), 81, 2.0, goal)
-    assert cost.shape == (81, 41) and step == 0.1 and left == 2.0
-    assert cost[70, 20] == 0.0
-    assert cost[10, 20] == pytest.approx(6.0)
-    assert cost[60, 10] == pytest.approx(np.sqrt(2.0))  # 1 m along each axis
-    assert cost[50, 10] == pytest.approx(np.sqrt(2.0) + 1.0)
+def ground(heights: Heights) -> Tile:
+    """A tile with heights of (x, y) in m, and no list of its features."""
+    x, y = np.meshgrid(np.arange(161) * CELL, np.arange(161) * CELL, indexing="ij")
+    surface = np.broadcast_to(heights(x, y), x.shape).astype(np.float32)
+    start, goal = np.array([0.75, 4.0, 0.0]), np.array([7.25, 4.0])
+    return Tile(surface, surface, start, goal, "own.npy", 1.0, ("own.npy",))
 
 
-def test_travel_cost_leads_around_a_wall() -> None:
-    # The wall leaves only a metre free, on the right.
-    wall = np.array([[4.0, y, 0.2] for y in np.arange(3.1, 6.1, 0.1)])
-    cost, _, _ = travel_cost(wall, 81, 2.0, np.array([7.0, 5.0]))
-    straight = 6.0
-    assert straight + 1.0 < cost[10, 30] < straight + 5.0  # not through it, at 30 per metre
+def trench(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A trench across the tile, with lips at 4 and 4.25 m."""
+    return np.where((x > 4.01) & (x < 4.24), -0.6, 0.0)
 
 
 class Course:
     """Robots that a test places on a tile each, with a teacher."""
 
-    def __init__(self, families: list[str], level: int) -> None:
+    def __init__(self, grounds: list[str | Heights], level: int) -> None:
         rng = np.random.default_rng(0)
-        self.field = TileField((len(families), 1))
-        for k, family in enumerate(families):
-            self.field.place(k, 0, make_tile(family, level / 10, rng))
-        self.origin = self.field.origin(np.arange(len(families)), 0)
-        self.loco = Locomotion(len(families), RobotConfig(), PhysicsConfig(), self.field)
+        self.field = TileField((len(grounds), 1))
+        for k, kind in enumerate(grounds):
+            tile = make_tile(kind, level / 10, rng) if isinstance(kind, str) else ground(kind)
+            self.field.place(k, 0, tile)
+        self.origin = self.field.origin(np.arange(len(grounds)), 0)
+        self.loco = Locomotion(len(grounds), RobotConfig(), PhysicsConfig(), self.field)
         self.goal = self.origin + [7.25, 4.0]
-        self.teacher = Teacher(self.field, families, CommandRanges(), Landing())
+        self.expects = np.array([family == "gap" for family in grounds])
+        self.lead(Landing())
+
+    def lead(self, landing: Landing | None) -> None:
+        """Start an episode with a teacher of a low policy with this ``landing``."""
+        self.teacher = Teacher(self.field, CommandRanges(), landing)
+        self.teacher.begin(np.arange(len(self.origin)), self.goal, self.expects)
 
     def put(self, x: float, y: float = 4.0, yaw: float = 0.0) -> None:
         m = len(self.origin)
@@ -56,9 +62,8 @@ class Course:
 def course():
     courses: list[Course] = []
 
-    def make(families: list[str], level: int = 8) -> Course:
-        courses.append(Course(families, level))
-        courses[-1].teacher.begin(np.arange(len(families)), courses[-1].goal)
+    def make(grounds: list[str | Heights], level: int = 8) -> Course:
+        courses.append(Course(grounds, level))
         return courses[-1]
 
     yield make
@@ -66,13 +71,12 @@ def course():
         made.loco.world.close()
 
 
-def test_each_family_is_walked_in_its_style(course) -> None:
-    families = [family for family in STYLES if family not in ("pillar", "clutter", "ditches")]
-    course = course(families)
+def test_the_ground_decides_how_to_walk(course) -> None:
+    styles = {"rough": UNEVEN, "stair": UNEVEN, "gap": LEAPING, "tilt": SLOPING}
+    course = course(list(styles))
     course.put(1.0)
     commands = course.commands()
-    for row, family in zip(commands, families, strict=True):
-        style = STYLES[family]
+    for row, (family, style) in zip(commands, styles.items(), strict=True):
         assert row[INDEX["vx"]] == pytest.approx(style.speed)
         assert row[INDEX["yaw_rate"]] == pytest.approx(0.0, abs=1e-9)
         swing = SWING_HEIGHT if family == "gap" else style.swing_height
@@ -87,12 +91,12 @@ def test_each_family_is_walked_in_its_style(course) -> None:
 def test_goes_uphill_across_a_slope(course) -> None:
     course = course(["tilt", "rough"])
     slope = course.field.features[0, 0].slope
-    climb = STYLES["tilt"].uphill * np.sin(slope)
+    climb = SLOPING.uphill * np.sin(slope)
     assert abs(climb) > 0.1
     for yaw in (0.0, 0.3):
         course.put(1.0, yaw=yaw)
         command = course.commands()[0]
-        ahead = STYLES["tilt"].speed * np.cos(yaw)
+        ahead = SLOPING.speed * np.cos(yaw)
         assert command[INDEX["vx"]] == pytest.approx(ahead + climb * np.sin(yaw))
         assert command[INDEX["vy"]] == pytest.approx(climb * np.cos(yaw))
     course.put(1.0)
@@ -103,12 +107,22 @@ def test_goes_uphill_across_a_slope(course) -> None:
     assert course.commands()[1, INDEX["vy"]] == 0.0  # level ground
 
 
+def test_walks_as_on_a_slope_only_near_it(course) -> None:
+    """The ground begins to rise to the left at 4 m, and slopes by 0.3 from 5 m on."""
+    course = course([lambda x, y: np.where(x < 4.0, 0.0, 0.3 * (y - 4.0) * np.clip(x - 4, 0, 1))])
+    for x, sloping in ((1.0, False), (2.5, False), (4.0, True), (6.0, True)):
+        course.put(x)
+        command = course.commands()[0]
+        assert command[INDEX["frequency"]] == (SLOPING if sloping else UNEVEN).frequency
+        assert (command[INDEX["vy"]] > 0.0) == sloping
+
+
 def test_turns_to_the_goal_and_slows_before_it(course) -> None:
     course = course(["stair"])
     course.put(1.0, yaw=-0.4)
     command = course.commands()[0]
     assert command[INDEX["yaw_rate"]] == pytest.approx(0.6)
-    assert command[INDEX["vx"]] == pytest.approx(STYLES["stair"].speed * np.cos(0.4))
+    assert command[INDEX["vx"]] == pytest.approx(UNEVEN.speed * np.cos(0.4))
     course.put(7.05)
     assert course.commands()[0, INDEX["vx"]] == pytest.approx(0.2)
 
@@ -125,33 +139,30 @@ def test_leaps_face_across_the_trenches_and_end_behind_them(course) -> None:
     assert command[INDEX["yaw_rate"]] == pytest.approx(-0.3)
     course.put(course.field.features[0, 0].trenches[-1, 1] + 0.55)
     command = course.commands()
-    assert gait_index(command[0]) == 0 and command[0, INDEX["frequency"]] == 3.0
+    assert gait_index(command[0]) == 0 and command[0, INDEX["frequency"]] == UNEVEN.frequency
 
 
 def test_goes_around_a_pillar(course) -> None:
-    course = course(["pillar"])
     # Its centre is left of the straight way, so the shorter way is on the right.
-    course.field.features[0, 0] = Features(pillars=np.array([[3.05, 4.15, 0.4]]))
-    course.teacher.begin(np.arange(1), course.goal)
+    course = course([lambda x, y: 0.8 * (np.hypot(x - 3.05, y - 4.15) < 0.2)])
     course.put(2.3)
     assert course.commands()[0, INDEX["yaw_rate"]] < -0.5
+    assert course.commands()[0, INDEX["vy"]] < -0.2
     course.put(4.0)  # behind it
     assert abs(course.commands()[0, INDEX["yaw_rate"]]) < 0.2
 
 
 def test_knows_both_ways_around_what_stands_before_it(course) -> None:
-    course = course(["pillar", "stair"])
-    pillars = np.array([[3.05, 4.0, 0.4], [3.05, 4.7, 0.3], [3.05, 3.4, 0.3]])
-    course.field.features[0, 0] = Features(pillars=pillars)  # a wall that ends sooner on the right
-    course.teacher.begin(np.arange(2), course.goal)
+    # A wall that ends sooner on the right.
+    wall = lambda x, y: 0.5 * ((np.abs(x - 3.0) < 0.12) & (np.abs(y - 4.1) < 0.6))  # noqa: E731
+    course = course([wall, "stair"])
     course.put(2.5)
     command, straight_on = course.commands()
     other, same = course.teacher.other
     assert command[INDEX["vy"]] < -0.3 and command[INDEX["yaw_rate"]] < -0.5
     assert other[INDEX["vy"]] > 0.3 and other[INDEX["yaw_rate"]] > 0.5
     np.testing.assert_array_equal(np.delete(other, WAY), np.delete(command, WAY))
-    # Around the wall's ends, 0.28 m from its pillars: the left way is 0.2 m longer, and near
-    # pillars a metre costs up to 3.
+    # Around the wall's ends: the left way is 0.2 m longer, and near walls a metre costs up to 3.
     assert 0.1 < course.teacher.dearer[0] < 0.6
     np.testing.assert_array_equal(same, straight_on)
     assert course.teacher.dearer[1] == 0.0
@@ -162,51 +173,52 @@ def test_knows_both_ways_around_what_stands_before_it(course) -> None:
         np.testing.assert_array_equal(course.teacher.dearer, 0.0)
 
 
-def test_a_family_without_a_style_is_walked_straight_on(course) -> None:
-    course = course(["mixed"])
-    course.put(1.0)
-    command = course.commands()[0]
-    assert command[INDEX["vx"]] == pytest.approx(UNEVEN.speed) and gait_index(command) == 0
-    assert command[INDEX["swing_height"]] == UNEVEN.swing_height
-
-
 def test_leaps_over_trenches_between_other_ground(course) -> None:
-    """On Ditches the robot walks until it sees the trench, leaps, and then walks again."""
-    course = course(["ditches", "gap"])
-    trench = np.array([[4.0, 4.25]])
-    course.field.features[0, 0] = Features(trenches=trench, pillars=np.array([[2.0, 4.6, 0.3]]))
-    course.field.features[1, 0] = Features(trenches=trench)
-    course.teacher.begin(np.arange(2), course.goal)
+    """The robot walks until it sees the trench, leaps, and then walks again."""
+    course = course([lambda x, y: trench(x, y) + 0.08 * ((x > 1.8) & (x < 2.5)), trench])
+    course.expects[1] = True
+    course.lead(Landing())
     for x, gait in ((4.0 - SIGHT - 0.05, 0), (4.0 - SIGHT + 0.05, 1), (4.7, 1), (4.8, 0)):
         course.put(x)
-        command, on_gap = course.commands()
+        command, expected = course.commands()
         assert gait_index(command) == gait
         if gait:
-            np.testing.assert_array_equal(command, on_gap)
+            np.testing.assert_array_equal(command, expected)
         else:
             assert command[INDEX["swing_height"]] == UNEVEN.swing_height
             assert command[INDEX["vx"]] == pytest.approx(UNEVEN.speed, abs=0.02)
+    course.put(1.0)
+    assert gait_index(course.commands()).tolist() == [0, 1]  # one is told that a trench will come
+
+
+def test_walks_around_a_pit_and_a_trench_that_is_too_wide(course) -> None:
+    """Neither can be leapt over; around the wide trench leads a bridge on the left."""
+    pit = lambda x, y: -0.6 * (np.hypot(x - 3.0, y - 3.95) < 0.25)  # noqa: E731
+    wide = lambda x, y: -0.6 * ((np.abs(x - 4.0) < 0.5) & (y < 4.8))  # noqa: E731
+    course = course([pit, wide])
+    course.put(2.4)
+    command = course.commands()
+    assert gait_index(command).tolist() == [0, 0]
+    assert (command[:, INDEX["yaw_rate"]] > 0.3).all()
+    assert (command[:, INDEX["vy"]] > 0.2).all()
 
 
 def test_a_policy_that_does_not_leap_walks_over_trenches(course) -> None:
     course = course(["gap"])
-    course.teacher = Teacher(course.field, ["gap"], CommandRanges(), None)
-    course.teacher.begin(np.arange(1), course.goal)
+    course.lead(None)
     course.put(1.7)
     command = course.commands()[0]
     assert command[INDEX["vx"]] == pytest.approx(UNEVEN.speed) and gait_index(command) == 0
 
 
 def test_who_is_not_told_of_trenches_leaps_when_it_sees_one(course) -> None:
-    course = course(["gap", "gap"])
-    course.field.features[1, 0] = course.field.features[0, 0]
-    course.teacher.begin(np.arange(2), course.goal, np.array([False, True]))
+    course = course(["gap"])
     lip = course.field.features[0, 0].trenches[0, 0]
+    course.expects[:] = False
+    course.lead(Landing())
     course.put(lip - SIGHT - 0.05)
-    leaps, walks = course.commands()
-    assert gait_index(leaps) == 1 and gait_index(walks) == 0
-    assert walks[INDEX["swing_height"]] == UNEVEN.swing_height
+    walks = course.commands()[0]
+    assert gait_index(walks) == 0 and walks[INDEX["swing_height"]] == UNEVEN.swing_height
     assert walks[INDEX["vx"]] == pytest.approx(UNEVEN.speed, abs=1e-3)
     course.put(lip - SIGHT + 0.05)
-    leaps, sees = course.commands()
-    assert gait_index(leaps) == gait_index(sees) == 1
+    assert gait_index(course.commands()[0]) == 1

@@ -84,7 +84,7 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("gp", "the scripted baseline", policy="gp"),
     Variant("gp-fixed-pose", "the same, nominal pose", low="fixed-pose", policy="gp"),
     Variant("gp-uncalibrated", "the same, not calibrated", low="uncalibrated", policy="gp"),
-    Variant("teacher", "the scripted teacher, told all", policy="teacher"),
+    Variant("teacher", "the scripted teacher, which knows the tile", policy="teacher"),
 )
 #: Rows for trainings with a teacher: without one, every robot is told its family.
 WITH_TEACHER = ("no-exchange", "no-teacher")

@@ -5,6 +5,8 @@ the benchmark's constants (where starts and goals lie along a tile) and where th
 when it leaps.
 """
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,8 +20,16 @@ from tdgc.sim.terrain import GOAL_X, ZONE
 from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
 from tdgc.tasks.leaps import BEYOND, SPEED, Landing, LeapPlan, Motion, leap_command, steer_leap
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
-from tdgc.tasks.teacher import STYLES, Style, toward
+from tdgc.tasks.teacher import CAREFUL, LEAPING, SLOPING, UNEVEN, Style, toward
 
+#: How to walk on each family.
+STYLES = {
+    "rough": UNEVEN,
+    "pillar": dataclasses.replace(UNEVEN, speed=CAREFUL),
+    "stair": UNEVEN,
+    "gap": LEAPING,
+    "tilt": SLOPING,
+}
 #: How to walk where the family is unknown: a compromise for rough ground, stairs and slopes.
 UNKNOWN = Style(0.6, frequency=3.2, swing_height=0.2, stance_width=0.33, uphill=0.45)
 
@@ -142,7 +152,7 @@ class CuesLaw:
         styles = [STYLES.get(name, UNKNOWN) for name in memory.told]
         command = np.array([style.command() for style in styles])
         fast = np.array([style.speed for style in styles])
-        fast[memory.pillar] = STYLES["pillar"].speed
+        fast[memory.pillar] = CAREFUL
         error, goal = bearing.copy(), np.array([GOAL_X, 0.0])
         for i in np.flatnonzero(memory.pillar).tolist():
             heading, at = memory.where.heading[0, i], memory.where.position[0, i]

@@ -139,9 +139,9 @@ class TeacherDriver(Driver):
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal, self.told = loco, goal, family
         assert loco.world.field is not None  # episodes run on tiles
-        families = [family] * loco.num_robots
-        self._teacher = Teacher(loco.world.field, families, self.bounds, self._landing)
-        self._teacher.begin(np.arange(loco.num_robots), goal)
+        self._teacher = Teacher(loco.world.field, self.bounds, self._landing)
+        expects = np.full(loco.num_robots, family == "gap")
+        self._teacher.begin(np.arange(loco.num_robots), goal, expects)
 
     def command(self, step: int) -> Array:
         decision, held = divmod(step, self.config.decimation)

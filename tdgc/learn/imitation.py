@@ -9,8 +9,8 @@ of the imitation, see ``NavigationTask``.
 For a leap the teacher also gives the cost of each step frequency with each stance length, and the
 policy learns to choose the cheapest (Ross and Bagnell 2014, AggreVaTe). With the teacher's own
 choice as the only target, it learned the mean of two ways over a trench, which leads into the
-trench. For the same reason the teacher labels both ways around a pillar, and only the error to the
-nearer one counts: a policy that learns their mean stands still in front of the pillar.
+trench. For the same reason the teacher labels both ways around an obstacle, and only the error to
+the nearer one counts: a policy that learns their mean stands still in front of it.
 
 The critic learns the returns of these episodes, so that PPO continues with a critic that knows the
 policy.

@@ -7,9 +7,9 @@ A tile is a height field h(x, y) of 8 m x 8 m; x is the direction of travel. Its
 
 and one number, the difficulty d, scales one geometric parameter per family (Eq. 1). The parameter
 is exact; the layout is drawn for each tile from its own generator. Ranges and shapes are those of
-TDGC-Bench 2. A tile lists its features (trenches, risers, pillars, slope), so that they need not be
-detected in the heights. All lengths are in m, all angles in rad. Arrays are indexed [ix, iy];
-sample [ix, iy] lies at (ix * CELL, iy * CELL).
+TDGC-Bench 2. A tile lists its features (trenches, risers, pillars, slope), for the low policy's
+training, the diagnosis, and to test what reads them from the heights. All lengths are in m, all
+angles in rad. Arrays are indexed [ix, iy]; sample [ix, iy] lies at (ix * CELL, iy * CELL).
 """
 
 import dataclasses
@@ -38,8 +38,6 @@ FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
 #: the same with trenches before or behind it.
 UNNAMED = CLUTTER, DITCHES = "clutter", "ditches"
 ALL_FAMILIES = (*FAMILIES, "mixed", *UNNAMED)
-#: Families whose tiles may have trenches.
-TRENCHED = ("gap", "mixed", DITCHES)
 #: A family name with this ending is the path of a user's height map, see ``height_map``.
 MAP_ENDING = ".npy"
 MAX_LEVEL = 10  # the hardest level of the curriculum, d = 1
@@ -488,6 +486,11 @@ def _share(section: Section) -> float:
 def is_map(family: str) -> bool:
     """Whether a family is the path of a user's height map."""
     return family.endswith(MAP_ENDING)
+
+
+def may_have_trenches(family: str) -> bool:
+    """Whether tiles of a family may have trenches."""
+    return is_map(family) or family in ("gap", "mixed", DITCHES)
 
 
 @functools.lru_cache

@@ -99,7 +99,7 @@ class NavigationTask:
         training: draw disturbances and let the curriculum change levels.
         visual: keep what rendering needs.
         taught: append a teacher's guidance to the observation, see ``tdgc.learn.imitation``: its
-            actions, a second way around pillars, and the prices of strides.
+            actions, a second way around obstacles, and the prices of strides.
         led: number of decisions per robot over which the share of episodes that the teacher drives
             falls from all to none.
         landing: where the low policy's feet land in leaps, for the teacher.
@@ -158,7 +158,7 @@ class NavigationTask:
         self.teacher = None
         if taught:
             assert config.commands is not None  # ``paired`` has set them
-            self.teacher = Teacher(self.field, self._families, config.commands, landing)
+            self.teacher = Teacher(self.field, config.commands, landing)
         self._lead, self._decisions = led, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
@@ -202,9 +202,13 @@ class NavigationTask:
         self._probes.begin(index)
         self._approach.begin(index, self.goal)
         if self.teacher is not None:
-            self.teacher.begin(index, self.goal, self._untold)
+            self.teacher.begin(index, self.goal, self._expects())
             share = 1.0 - self._decisions[0] / self._lead if self._lead else 0.0
             self._led[index] = rng.uniform(size=n) < share
+
+    def _expects(self) -> NDArray[np.bool_]:
+        """Which robots are told that there are trenches on their tile, (M,)."""
+        return self.family_index == SEMANTIC.index("gap")
 
     def _width(self) -> Array:
         """Scale of each robot's disturbances, (M,), growing with its level from 0 to 1."""
@@ -408,7 +412,7 @@ class NavigationTask:
         self.locomotion.world.upload_terrain()
         self.locomotion.load_state_dict(episodes["locomotion"])
         if self.teacher is not None:
-            self.teacher.begin(np.arange(self.num_robots), self.goal, self._untold)
+            self.teacher.begin(np.arange(self.num_robots), self.goal, self._expects())
             self.teacher.speed[:] = episodes["speed"]
 
     def close(self) -> None:

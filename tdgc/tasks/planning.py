@@ -1,19 +1,19 @@
-"""Ways around pillars on a grid: the cost of each place, and the least cost to go from there."""
+"""Ways around obstacles on a grid: the cost of each place, and the least cost to go from there."""
 
 import numpy as np
 
 from tdgc.sim.robot import Array
 
 LOOK = 0.35  # m ahead, the distance at which a robot compares costs in different directions
-#: m from a pillar within which the way is blocked: half the trunk's diagonal and a little. Pillars
-#: leave at least 0.6 m between them.
+#: m from an obstacle within which the way is blocked: half the trunk's diagonal and a little.
+#: Pillars leave at least 0.6 m between them.
 RADIUS = 0.28
 _BLOCKED, _CLOSE = 30.0, 3.0  # cost per metre inside the radius and at its edge; 1 in the open
 _AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 
 
 def price_near(away: Array, wide: float) -> Array:
-    """Cost per metre at ``away`` (...) m from the nearest pillar, which counts up to ``wide`` m."""
+    """Cost per metre at ``away`` (...) m from an obstacle, which counts up to ``wide`` m."""
     near = np.clip((wide - away) / (wide - RADIUS), 0.0, 1.0)
     return np.where(away < RADIUS, _BLOCKED, 1.0 + (_CLOSE - 1.0) * near)
 

@@ -1,14 +1,14 @@
-"""A scripted expert for each training family, which the high policy imitates first.
+"""A scripted expert, which the high policy imitates first.
 
-It is told what the high policy has to infer from its cues: the robot's position on the tile and its
-speed, the way around pillars, and where the trenches are. How to walk on each family was found by
+It knows what the high policy has to infer from its cues: where the robot is on the tile, how fast
+it moves, and the heights of the tile. From these it reads obstacles, trenches and slopes
+(``tdgc.tasks.survey``), so it leads on any terrain, a family or a user's map. It is told only
+whether the high policy expects trenches, and then leaps from the start. How to walk was found by
 trials on training tiles (docs/experiments.md). Leaps over trenches show why imitation comes first:
 they take pronk at nearly full speed with steps timed to a few centimetres, which exploration that
 starts from a trot does not find.
 """
 
-import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from tdgc.config import CommandRanges
 from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
-from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, UNNAMED, TileField
+from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
 from tdgc.tasks.leaps import (
     BEYOND,
     FREQUENCIES,
@@ -31,7 +31,8 @@ from tdgc.tasks.leaps import (
     speed_up,
     steer_leap,
 )
-from tdgc.tasks.planning import LOOK, between, cost_to_go, price_near
+from tdgc.tasks.planning import LOOK, between
+from tdgc.tasks.survey import GRID, survey
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class Style:
         return command
 
 
-#: Style on steps and bumps, and for families without a style of their own.
+# Values other than Walk These Ways' defaults are from docs/experiments.md.
+#: Style on steps and bumps, and wherever there is no reason for another.
 UNEVEN = Style(
     0.6,
     frequency=2.3,
@@ -77,29 +79,20 @@ UNEVEN = Style(
     duration=0.55,
     pitch=-0.07,
 )
-#: Style of each family. Values other than Walk These Ways' defaults are from docs/experiments.md.
-STYLES = {
-    "rough": UNEVEN,
-    # Slower, with feet and trunk as high: what looks like a pillar from afar may be a step on
-    # unfamiliar ground.
-    "pillar": dataclasses.replace(UNEVEN, speed=0.5),
-    "stair": UNEVEN,
-    # In pronk, see ``tdgc.tasks.leaps``.
-    "gap": Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1),
-    "tilt": Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45),
-    **dict.fromkeys(UNNAMED, UNEVEN),
-}
+#: m/s, speed among obstacles.
+CAREFUL = 0.5
+#: Style on lateral slopes.
+SLOPING = Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45)
+#: Style of leaps, in pronk, see ``tdgc.tasks.leaps``.
+LEAPING = Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1)
 
 #: m ahead at which the probes see a trench; they reach 1.2 m.
 SIGHT = 1.15
 
-# Ways around pillars follow a field of travel costs on every second sample of the tile.
-_COARSE = 2
 _SEEN = 0.5  # weight of a newly seen speed in the estimate: it oscillates within a gait cycle
-_WIDE = 0.55  # m from a pillar, beyond which it adds no cost
 _RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)
 _APART = 0.9  # rad, least angle between two ways whose mean would lead into the obstacle
-#: Commands in which the two ways around a pillar differ.
+#: Commands in which the two ways around an obstacle differ.
 WAY = [INDEX[name] for name in ("vx", "vy", "yaw_rate")]
 
 
@@ -127,37 +120,11 @@ def toward(
     return speed * np.maximum(np.cos(error), 0.0), turn
 
 
-def travel_cost(pillars: Array, width: int, left: float, goal: Array) -> tuple[Array, float, float]:
-    """Cost of travelling to the goal, around pillars, from every point of a tile.
-
-    Args:
-        pillars: (k, 3) m, x, y and diameter.
-        width: samples across the tile.
-        left: m, y of the first of these samples in the tile's frame.
-        goal: (2,) m in the tile's frame.
-
-    Returns:
-        The field (81, width // 2 + 1), its step in m, and ``left``.
-    """
-    step = _COARSE * CELL
-    x = np.arange(0, TILE_SAMPLES, _COARSE) * CELL
-    y = left + np.arange(0, width, _COARSE) * CELL
-    away = np.full((len(x), len(y)), np.inf)
-    for cx, cy, diameter in pillars:
-        distance = np.hypot(x[:, None] - cx, y - cy) - 0.5 * diameter
-        np.minimum(away, distance, out=away)
-    cost = np.full(away.shape, np.inf)
-    at = np.clip(np.round((goal - [0.0, left]) / step).astype(int), 0, np.array(away.shape) - 1)
-    cost[at[0], at[1]] = 0.0
-    return cost_to_go(cost, step * price_near(away, _WIDE)), step, left
-
-
 class Teacher:
     """Commands M robots, each on a tile of its own.
 
     Args:
         field: (M, 1) tiles.
-        families: (M,) names of the tiles' families.
         ranges: command ranges that the low policy was trained on.
         landing: the low policy's; None for one that cannot leap, which walks over trenches.
 
@@ -168,71 +135,54 @@ class Teacher:
             do not leap.
         other: (M, 15) the last ``commands``, but along the second way around an obstacle; the same
             commands where there is no second way.
-        dearer: (M,) m, how much longer the second way is, including the cost of being near pillars.
+        dearer: (M,) m, how much longer the second way is, including the cost of being near
+            obstacles.
     """
 
-    def __init__(
-        self,
-        field: TileField,
-        families: Sequence[str],
-        ranges: CommandRanges,
-        landing: Landing | None,
-    ) -> None:
-        m = len(families)
+    def __init__(self, field: TileField, ranges: CommandRanges, landing: Landing | None) -> None:
+        m = field.shape[0]
         self._field, self._ranges, self._landing = field, ranges, landing
         self._origin = field.origin(np.arange(m), 0)
-        self._gap = np.array([family == "gap" for family in families])
-        self._detours = np.array([family in ("pillar", *UNNAMED) for family in families])
-        styles = [
-            UNEVEN if family == "gap" and landing is None else STYLES.get(family, UNEVEN)
-            for family in families
-        ]
-        commands = np.array([style.command() for style in [*styles, UNEVEN, STYLES["gap"]]])
+        commands = np.array([style.command() for style in (UNEVEN, SLOPING, LEAPING)])
         # The low policy may have been trained on narrower ranges than the styles use.
         bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
         behaviour = commands[:, : len(CONTINUOUS)]
         np.clip(behaviour, bounds[:, 0], bounds[:, 1], out=behaviour)
-        self._command, self._uneven, self._leap = commands[:-2], commands[-2], commands[-1]
+        self._uneven, self._sloping, self._leap = commands
         self.speed = np.zeros(m)
         self.price = np.zeros((m, FREQUENCIES, LENGTHS))
         self.other = np.zeros((m, len(default_command())))
         self.dearer = np.zeros(m)
-        self._top_speed = np.array([style.speed for style in styles])
-        self._uphill = np.array([style.uphill for style in styles])
-        self._climb = np.zeros(m)  # m/s uphill, positive along the tile's y (left)
+        self._slope = np.zeros((m, TILE_SAMPLES, field.heights.shape[1]))
+        self._costs: dict[int, Array] = {}  # of travelling, on tiles with obstacles
         self._plan = LeapPlan(m, ranges)
         self._leap_speed = min(SPEED, ranges.vx[1])
         self._start = np.full(m, -np.inf)  # m, x where a robot starts to leap
         self._end = np.full(m, -np.inf)  # m, x where a robot stops leaping
-        self._fields: dict[int, tuple[Array, float, float]] = {}
 
-    def begin(
-        self, index: NDArray[np.integer], goal: Array, untold: NDArray[np.bool_] | None = None
-    ) -> None:
-        """Plan leaps and ways around pillars on the tiles of the robots ``index`` (n,).
+    def begin(self, index: NDArray[np.integer], goal: Array, expects: NDArray[np.bool_]) -> None:
+        """Plan leaps and ways around obstacles on the tiles of the robots ``index`` (n,).
 
         Args:
             index: the robots.
             goal: (M, 2) m in the world.
-            untold: (M,) robots whose high policy is not told the family; none if None. Such a
-                robot, like one on a family other than Gap, starts to leap only ``SIGHT`` m before
-                the first trench, when it can see it.
+            expects: (M,) robots whose high policy is told that there are trenches. They leap from
+                the start; others begin ``SIGHT`` m before the first trench, when they can see it.
         """
-        width = self._field.heights.shape[1]
+        field, n = self._field, TILE_SAMPLES
         self.speed[index] = 0.0
-        slopes = [self._field.features[int(i), 0].slope for i in index]
-        self._climb[index] = self._uphill[index] * np.sin(slopes)
         self._start[index] = self._end[index] = -np.inf
-        for i in index:
-            trenches = self._field.features[int(i), 0].trenches
-            if self._landing is not None and len(trenches):
-                self._plan.look(int(i), trenches, self._landing.spread)
-                blind = not self._gap[i] or (untold is not None and untold[i])
-                self._start[i] = trenches[0, 0] - SIGHT if blind else -np.inf
-                self._end[i] = trenches[-1, 1] + BEYOND
-        for i in index[self._detours[index]]:
-            pillars, target = self._field.features[int(i), 0].pillars, goal[i] - self._origin[i]
-            self._fields[int(i)] = travel_cost(pillars, width, self._field.crop, target)
+        for i in index.tolist():
+            heights = field.heights[i * n : (i + 1) * n]
+            found = survey(heights, field.crop, goal[i] - self._origin[i])
+            self._slope[i] = found.slope
+            self._costs.pop(i, None)
+            if found.cost is not None:
+                self._costs[i] = found.cost
+            if self._landing is not None and len(found.trenches):
+                self._plan.look(i, found.trenches, self._landing.spread)
+                self._start[i] = -np.inf if expects[i] else found.trenches[0, 0] - SIGHT
+                self._end[i] = found.trenches[-1, 1] + BEYOND
 
     def watch(self, loco: Locomotion, seconds: float) -> None:
         """Update the speed estimates; to be called once per decision of ``seconds``."""
@@ -248,17 +198,23 @@ class Teacher:
         local = state.position[:, :2] - self._origin
         second = bearing.copy()
         self.dearer[:] = 0.0
-        for i, field in self._fields.items():
+        detour = np.zeros(len(distance), dtype=bool)
+        for i, cost in self._costs.items():
+            detour[i] = True
             if distance[i] > LOOK:
-                bearing[i], second[i], self.dearer[i] = _ways(field, local[i], bearing[i])
-        blind = local[:, 0] < self._start
-        command = np.where(blind[:, None], self._uneven, self._command)
-        top_speed = np.where(blind, UNEVEN.speed, self._top_speed)
+                at = local[i], bearing[i]
+                bearing[i], second[i], self.dearer[i] = _ways(cost, self._field.crop, *at)
+        slope = self._slope_at(local)
+        sloping = slope != 0.0
+        command = np.where(sloping[:, None], self._sloping, self._uneven)
+        top_speed = np.where(sloping, SLOPING.speed, UNEVEN.speed)
+        top_speed[detour] = CAREFUL
+        climb = SLOPING.uphill * np.sin(np.arctan(slope))
         self.other = command.copy()
         for way, toward_bearing in ((command, bearing), (self.other, second)):
-            way[:, WAY] = self._walk(state.yaw, distance, toward_bearing, top_speed)
+            way[:, WAY] = self._walk(state.yaw, distance, toward_bearing, top_speed, detour, climb)
         self.price[:] = 0.0
-        rows = np.flatnonzero(~blind & (local[:, 0] < self._end))
+        rows = np.flatnonzero((local[:, 0] >= self._start) & (local[:, 0] < self._end))
         if rows.size and self._landing is not None:
             leaps = np.tile(self._leap, (len(rows), 1))
             steer_leap(leaps, bearing[rows], state.yaw[rows], self._ranges)
@@ -272,29 +228,51 @@ class Teacher:
             self.other[rows], self.dearer[rows] = leaps, 0.0
         return command
 
-    def _walk(self, yaw: Array, distance: Array, bearing: Array, top_speed: Array) -> Array:
-        """Velocities ``WAY`` (M, 3) towards points at ``distance`` m and ``bearing`` rad."""
+    def _slope_at(self, local: Array) -> Array:
+        """Tangents of the slopes at (M, 2) m in the tiles' frames, (M,)."""
+        m, n, width = self._slope.shape
+        at = np.round((local - [0.0, self._field.crop]) / CELL).astype(int)
+        i, j = np.clip(at, 0, [n - 1, width - 1]).T
+        return np.asarray(self._slope[np.arange(m), i, j])
+
+    def _walk(
+        self,
+        yaw: Array,
+        distance: Array,
+        bearing: Array,
+        top_speed: Array,
+        detour: NDArray[np.bool_],
+        climb: Array,
+    ) -> Array:
+        """Velocities ``WAY`` (M, 3) towards points.
+
+        Args:
+            yaw: (M,) rad.
+            distance, bearing: (M,) m and rad, of the points.
+            top_speed: (M,) m/s.
+            detour: (M,) robots that walk around obstacles: they may move in any direction, also
+                backward, off one that they lean on.
+            climb: (M,) m/s to the tile's left, against sliding down a slope.
+        """
         error = wrap_angle(bearing - yaw)
         speed, turn = toward(distance, error, top_speed, turns=self._ranges.yaw_rate)
-        # Around obstacles a robot may move in any direction, also backward, off one it leans on.
-        any_way = np.where(self._detours, np.minimum(top_speed, distance), 0.0)
-        speed = np.where(self._detours, any_way * np.cos(error), speed)
-        vx = np.clip(speed + self._climb * np.sin(yaw), *self._ranges.vx)
-        vy = np.clip(any_way * np.sin(error) + self._climb * np.cos(yaw), *self._ranges.vy)
+        any_way = np.where(detour, np.minimum(top_speed, distance), 0.0)
+        speed = np.where(detour, any_way * np.cos(error), speed)
+        vx = np.clip(speed + climb * np.sin(yaw), *self._ranges.vx)
+        vy = np.clip(any_way * np.sin(error) + climb * np.cos(yaw), *self._ranges.vy)
         return np.column_stack([vx, vy, turn])
 
 
-def _ways(field: tuple[Array, float, float], at: Array, ahead: float) -> tuple[float, float, float]:
+def _ways(cost: Array, left: float, at: Array, ahead: float) -> tuple[float, float, float]:
     """Cheapest and second cheapest direction in rad from ``at`` (2,) m, and the difference in cost.
 
     The difference is in m. The second direction is a local minimum of the travel cost, below the
     cost at ``at`` and more than ``_APART`` from the first; without one, the first is returned
     twice. Near ties go to the direction closest to ``ahead``.
     """
-    cost, step, left = field
 
     def to_go(x: Array | float, y: Array | float) -> Array:
-        cells = np.column_stack([x, y - left]) / step
+        cells = np.column_stack([x, y - left]) / GRID
         return between(cost, np.clip(cells, 0.0, np.array(cost.shape) - 1.001))
 
     x, y = at[0] + LOOK * np.cos(_RAYS), at[1] + LOOK * np.sin(_RAYS)
