@@ -32,7 +32,7 @@ from tdgc.benchmark.results import FILES, STOPS, describe, salvage, what_stopped
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
-from tdgc.config import HighLevelConfig, LowLevelConfig
+from tdgc.config import HighLevelConfig, LowLevelConfig, TeacherConfig, recorded
 from tdgc.errors import InputError, require
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
@@ -44,6 +44,7 @@ from tdgc.sim.geometry import read_geometry
 from tdgc.sim.world import WindowError
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
+from tdgc.tasks.teacher import Skill
 
 POLICIES = ("tdgc", "gp")
 TEACHER = "teacher"
@@ -220,6 +221,15 @@ class Evaluation:
         """The function that distributes jobs to processes, here or in the cluster."""
         return run_jobs if self.cluster is None else cluster.run_jobs
 
+    def skill(self, low: Policy, config: LowLevelConfig) -> Skill:
+        """What the scripts have to know of the low policy. They command it like the teacher of the
+        high policy."""
+        taught = None if self.high is None else load(self.high).meta.get("teacher")
+        manner = TeacherConfig()
+        if taught is not None:
+            manner = recorded(TeacherConfig, taught, f"{self.high}, meta.teacher")
+        return Skill(measure_landing(low, config, manner.leap_speed), manner)
+
     def drivers(self, low: Policy, config: LowLevelConfig) -> dict[str, Driver]:
         """Make the driver of each policy; the tuned one follows ``tdgc``.
 
@@ -234,10 +244,10 @@ class Evaluation:
             if name == "gp":
                 drivers[name] = BaselineDriver(bounds=config.commands)
             elif name == TEACHER:
-                drivers[name] = TeacherDriver(low, config)
+                drivers[name] = TeacherDriver(config, self.skill(low, config))
             elif name == CUES:
                 mdp = HighLevelConfig(commands=config.commands)
-                law = CuesLaw(config, measure_landing(low, config), mdp)
+                law = CuesLaw(config, self.skill(low, config), mdp)
                 drivers[name] = HierarchyDriver(law, mdp)
             else:
                 assert self.high is not None

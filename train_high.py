@@ -52,7 +52,9 @@ from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
+from tdgc.tasks.teacher import Skill
 from tdgc.tasks.tiles import check_families, check_levels
+from tdgc.tasks.trials import suit
 
 # Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
 # the apprentice alone drives, so that it learns in the states to which its own actions lead.
@@ -88,6 +90,15 @@ def pin_low(config: HighTrainConfig) -> HighTrainConfig:
     return dataclasses.replace(config, low_sha256=found)
 
 
+def with_teacher(config: HighTrainConfig, low: Policy) -> HighTrainConfig:
+    """Add how the teacher best commands the low policy, if there is a teacher and it is not set."""
+    imitation = config.imitation
+    if not imitation.steps or imitation.teacher is not None:
+        return config
+    found = suit(low, any(map(may_have_trenches, config.env.families)), tqdm.write)
+    return dataclasses.replace(config, imitation=dataclasses.replace(imitation, teacher=found))
+
+
 def start_action(config: HighTrainConfig) -> Array:
     """Compute the action for walking straight ahead in the default gait, (13,).
 
@@ -121,14 +132,18 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
 def make_env(
     config: HighTrainConfig, low: Policy, taught: bool, led: float, timeout: float, link: MakeLink
 ) -> TaskVecEnv:
-    """Start the workers; ``taught`` and ``led`` as in ``NavigationTask``."""
-    env_config, landing = config.env, None
-    if taught and any(map(may_have_trenches, env_config.families)):
-        landing = measure_landing(*load_low(low))
-        if landing is None:
-            tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
+    """Start the workers; ``led`` as in ``NavigationTask``, ``taught``: whether with a teacher."""
+    env_config, skill = config.env, None
+    if taught:
+        landing, manner = None, config.imitation.teacher
+        assert manner is not None  # ``with_teacher`` has set it
+        if any(map(may_have_trenches, env_config.families)):
+            landing = measure_landing(*load_low(low), manner.leap_speed)
+            if landing is None:
+                tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
+        skill = Skill(landing, manner)
     return TaskVecEnv(
-        functools.partial(NavigationTask, env_config, low, taught=taught, led=led, landing=landing),
+        functools.partial(NavigationTask, env_config, low, taught=skill, led=led),
         config.n_envs,
         config.workers,
         config.seed,
@@ -320,6 +335,7 @@ def main(arguments: list[str] | None = None) -> int:
         check_randomisation(config.env.randomisation, low_config.physics, trunk)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check(config)
+        config = with_teacher(config, low)
         meta: dict[str, Any] = {
             "config": to_dict(config.env),
             "low": {"config": to_dict(low_config), "observation": low.actor_dim},
@@ -327,6 +343,8 @@ def main(arguments: list[str] | None = None) -> int:
             "code": __version__,
             "benchmark": EDITION,
         }
+        if config.imitation.teacher is not None:
+            meta["teacher"] = to_dict(config.imitation.teacher)
         run = Run(
             args.out, config, meta, summarise, Interruption(args.time_limit), args.worker_timeout,
             worker_link(args), args.init,

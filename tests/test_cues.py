@@ -18,6 +18,7 @@ from tdgc.sim.terrain import GOAL_X, START_X
 from tdgc.tasks.leaps import Landing, LeapPlan, Motion, measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES
+from tdgc.tasks.teacher import Skill
 
 LOW, CONFIG = load_low(PRETRAINED / "low")
 POINTS = PROBES[HighLevelConfig().probes]
@@ -111,7 +112,9 @@ class Watched(CuesLaw):
 
 @pytest.fixture(scope="module")
 def law() -> Watched:
-    return Watched(CONFIG, measure_landing(LOW, CONFIG), HighLevelConfig(commands=CONFIG.commands))
+    return Watched(
+        CONFIG, Skill(measure_landing(LOW, CONFIG)), HighLevelConfig(commands=CONFIG.commands)
+    )
 
 
 def run(law: CuesLaw, condition: str, family: str, level: int, count: int) -> list[str]:

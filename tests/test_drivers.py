@@ -41,6 +41,7 @@ from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, Seen, high_layout
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
+from tdgc.tasks.teacher import Skill
 
 LOW = PRETRAINED / "low"
 CONFIG = HighLevelConfig(
@@ -154,11 +155,11 @@ def test_baseline_keeps_to_the_ranges_that_it_is_given(low):
 @pytest.mark.parametrize("family", ["gap", "stair"])
 def test_the_teacher_drives_as_it_teaches(low, family):
     """Its commands are those that the student is shown, held for a decision."""
-    config, landing = dataclasses.replace(CONFIG, families=(family,)), measure_landing(*low)
-    task = NavigationTask(config, LOW, 2, seed=4, training=False, taught=True, landing=landing)
+    config, skill = dataclasses.replace(CONFIG, families=(family,)), Skill(measure_landing(*low))
+    task = NavigationTask(config, LOW, 2, seed=4, training=False, taught=skill)
     try:
         task.reset(np.arange(2))
-        executor, driver = Executor(task.locomotion, low[0]), TeacherDriver(*low)
+        executor, driver = Executor(task.locomotion, low[0]), TeacherDriver(low[1], skill)
         driver.begin(task.locomotion, task.goal, family)
         for step in range(12):
             if step % 5 == 0:

@@ -8,6 +8,7 @@ import errno
 import json
 import math
 import re
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,14 @@ from tdgc.benchmark.evaluation import (
 from tdgc.benchmark.trace import Selection
 from tdgc.benchmark.tracking import track_gait
 from tdgc.benchmark.tuning import TunedDriver, Tuning
-from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, RandomisationConfig
+from tdgc.config import (
+    CommandRanges,
+    LowLevelConfig,
+    PhysicsConfig,
+    RandomisationConfig,
+    TeacherConfig,
+    to_dict,
+)
 from tdgc.errors import InputError
 from tdgc.parallel.worker import WorkerError
 from tdgc.show import gui
@@ -411,6 +419,27 @@ def test_the_teacher_leads_on_any_terrain(tmp_path):
         outcomes = [(row["family"], row["outcome"]) for row in csv.DictReader(file)]
     assert {outcome for family, outcome in outcomes if family == str(course)} == {"reached"}
     assert "mixed" in {family for family, _ in outcomes}
+
+
+def test_the_scripts_command_as_the_teacher_of_the_high_policy_did(low, tmp_path, capsys):
+    """A high policy of another robot had a teacher that walked, stepped and leapt differently."""
+    config, high = load_low(low)[1], tmp_path / "high"
+    header = json.loads((PRETRAINED / "high.json").read_text(encoding="utf-8"))
+    flags = ["--policies", "teacher", "--families", "stair", "--workers", "1", "--high", str(high)]
+    shutil.copy(PRETRAINED / "high.safetensors", tmp_path)
+    walked = []
+    for taught in (TeacherConfig(), TeacherConfig(0.9, 3.3, 1.0)):
+        header["meta"]["teacher"] = to_dict(taught)
+        high.with_suffix(".json").write_text(json.dumps(header), encoding="utf-8")
+        asked = evaluate.Evaluation.of(evaluate.parse(flags))
+        (driver,) = asked.drivers(low, config).values()
+        (episode,) = run_cell(Cell("teacher", "nominal", "rough", 2, 0, 1), low, driver, 0)
+        walked.append(episode.path_m / episode.time_s)
+    assert walked[1] > 1.3 * walked[0]  # 0.9 m/s and 0.6 m/s, but for the ends
+    del header["meta"]["teacher"]["leap_speed"]
+    high.with_suffix(".json").write_text(json.dumps(header), encoding="utf-8")
+    assert evaluate.main(flags) == 2
+    assert "high, meta.teacher: no key 'leap_speed'" in capsys.readouterr().err
 
 
 def test_the_window_shows_the_tuned_policy(monkeypatch):

@@ -40,7 +40,7 @@ from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rewards import HighStep
-from tdgc.tasks.teacher import WAY
+from tdgc.tasks.teacher import WAY, Skill
 
 LOW = PRETRAINED / "low"
 POINTS = PROBES[HighLevelConfig().probes]
@@ -245,7 +245,7 @@ def test_a_symmetric_policy_needs_the_same_bounds_to_both_sides():
 
 def test_the_teachers_episodes_move_no_levels():
     config = dataclasses.replace(CONFIG, window=2, threshold=2, first_levels=3)
-    task = NavigationTask(config, LOW, 10, seed=0, taught=True, led=75)
+    task = NavigationTask(config, LOW, 10, seed=0, taught=Skill(), led=75)
     task.reset(np.arange(10))
     task.curriculum.push(np.arange(10), np.zeros(10, dtype=bool))
     task._led[:] = np.arange(10) < 5
@@ -436,7 +436,7 @@ def test_velocities_alone_leave_the_other_commands_at_their_defaults():
 def test_a_teacher_says_what_can_be_said_of_what_it_does():
     """A student limited to trot at fixed parameters is still shown the velocities of a leap."""
     config = dataclasses.replace(CONFIG, families=("gap",), gaits=("trot",), behaviour="velocities")
-    task = NavigationTask(config, LOW, 2, seed=0, taught=True, led=6, landing=Landing())
+    task = NavigationTask(config, LOW, 2, seed=0, taught=Skill(Landing()), led=6)
     try:
         task.reset(np.arange(2))
         size = width(high_layout(CONFIG))
@@ -469,7 +469,7 @@ def test_robots_begin_spread_over_the_first_levels():
 def test_a_teacher_shows_the_second_way_around_pillars():
     """The guidance holds the difference of the second way from the first, in actions."""
     task = NavigationTask(
-        dataclasses.replace(CONFIG, families=("pillar",)), LOW, 40, 0, taught=True
+        dataclasses.replace(CONFIG, families=("pillar",)), LOW, 40, 0, taught=Skill()
     )
     try:
         task.curriculum.levels[:] = 9
@@ -497,7 +497,7 @@ def test_a_teacher_shows_the_second_way_around_pillars():
 
 def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
     config = dataclasses.replace(CONFIG, families=("stair", "gap"), episode_seconds=0.2)
-    task = NavigationTask(config, LOW, 40, seed=0, taught=True, led=6)
+    task = NavigationTask(config, LOW, 40, seed=0, taught=Skill(), led=6)
     try:
         task.reset(np.arange(40))
         size = width(high_layout(CONFIG))
@@ -519,7 +519,7 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
         task.close()
 
 
-@pytest.mark.parametrize("taught", [False, True])
+@pytest.mark.parametrize("taught", [None, Skill()])
 @pytest.mark.parametrize("episodes", [True, False])
 def test_the_future_follows_from_the_state(episodes, taught):
     """A task that loads a state continues exactly as the one that saved it.
@@ -592,7 +592,7 @@ def test_nan_action_is_refused(task):
 def test_a_robot_that_blew_up_gets_no_guidance():
     """The worker ends its episode, and those of the others; the teacher cannot command it."""
     config = dataclasses.replace(CONFIG, families=("clutter", "gap"))
-    task = NavigationTask(config, LOW, 2, seed=0, taught=True, landing=Landing())
+    task = NavigationTask(config, LOW, 2, seed=0, taught=Skill(Landing()))
     task.reset(np.arange(2))
     assert task.observe()[:, -GUIDANCE:].any()
     task.locomotion.world.state.position[0] = np.nan
@@ -607,7 +607,7 @@ def test_a_robot_that_blew_up_gets_no_guidance():
 def test_without_the_semantic_cue_no_robot_is_told(cues, untold):
     """So the teacher leaps only where trenches can be seen."""
     config = dataclasses.replace(CONFIG, families=("gap",), cues=cues, unknown_share=0.0)
-    task = NavigationTask(config, LOW, 2, seed=0, taught=True, landing=Landing())
+    task = NavigationTask(config, LOW, 2, seed=0, taught=Skill(Landing()))
     task.reset(np.arange(2))
     gaits = gait_index(task.teacher.commands(task.locomotion, task.goal))
     task.close()

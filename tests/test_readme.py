@@ -65,7 +65,8 @@ class Run:
 LOW = "--steps 128 --n-envs 4 --workers 1 --set log_steps=128 --set calibration.robots=0"
 HIGH = (
     "--steps 16 --n-envs 4 --workers 1 --set log_steps=8 "
-    "--set ppo.n_steps=2 --set ppo.minibatches=1 --set imitation.minibatches=1"
+    "--set ppo.n_steps=2 --set ppo.minibatches=1 --set imitation.minibatches=1 "
+    "--set imitation.teacher.walk_speed=0.6"
 )
 ONE = "--episodes 1 --workers 1"
 FALL = f"--policies gp --families gap --levels 10 {ONE}"  # into the first trench, within seconds

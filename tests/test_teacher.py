@@ -12,7 +12,7 @@ from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.terrain import CELL, Tile, TileField, make_tile
 from tdgc.tasks.leaps import SWING_HEIGHT, Landing
-from tdgc.tasks.teacher import LEAPING, SIGHT, SLOPING, UNEVEN, WAY, Teacher
+from tdgc.tasks.teacher import LEAPING, SIGHT, SLOPING, UNEVEN, WAY, Skill, Teacher
 
 Heights = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -47,7 +47,7 @@ class Course:
 
     def lead(self, landing: Landing | None) -> None:
         """Start an episode with a teacher of a low policy with this ``landing``."""
-        self.teacher = Teacher(self.field, CommandRanges(), landing)
+        self.teacher = Teacher(self.field, CommandRanges(), Skill(landing))
         self.teacher.begin(np.arange(len(self.origin)), self.goal, self.expects)
 
     def put(self, x: float, y: float = 4.0, yaw: float = 0.0) -> None:

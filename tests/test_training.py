@@ -441,7 +441,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         "--set", "ppo.lstm=8",
         "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.7",
         "--set", "imitation.steps=16", "--set", "imitation.levels_after=hardest",
-        "--set", "imitation.kept=2",
+        "--set", "imitation.kept=2", "--set", "imitation.teacher.walk_speed=0.6",
         "--set", 'env.families=["rough","pillar"]',
     ]  # fmt: skip
     monkeypatch.chdir(ROOT)  # where ``kill_run`` starts the resumed run

@@ -18,9 +18,9 @@ from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, ZONE
 from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
-from tdgc.tasks.leaps import BEYOND, SPEED, Landing, LeapPlan, Motion, leap_command, steer_leap
+from tdgc.tasks.leaps import BEYOND, Landing, LeapPlan, Motion, leap_command, steer_leap
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
-from tdgc.tasks.teacher import CAREFUL, LEAPING, SLOPING, UNEVEN, Style, toward
+from tdgc.tasks.teacher import CAREFUL, LEAPING, SLOPING, UNEVEN, Skill, Style, toward
 
 #: How to walk on each family.
 STYLES = {
@@ -62,9 +62,7 @@ class Memory:
         command: (M, 15) commands of the last decision.
     """
 
-    def __init__(
-        self, low: LowLevelConfig, told: list[str], distance: Array, bearing: Array
-    ) -> None:
+    def __init__(self, plan: LeapPlan, told: list[str], distance: Array, bearing: Array) -> None:
         m = len(told)
         self.told = told
         self.where = Reckoning(distance, bearing)
@@ -75,7 +73,7 @@ class Memory:
         self.unknown = np.array([name == "unknown" for name in told])
         self.slope = np.zeros(m)
         self.x = self.where.position[..., 0]
-        self.plan = LeapPlan(m, low.commands, _CLEAR)
+        self.plan = plan
         self.planned = [np.full((1, 2), np.nan)] * m
         self.command = np.tile(default_command(), (m, 1))
 
@@ -85,14 +83,20 @@ class CuesLaw:
 
     Args:
         low: the low policy's MDP.
-        landing: the low policy's landing; None for one that cannot leap and so walks over trenches.
+        skill: of the low policy.
         config: the MDP of the decisions.
     """
 
-    def __init__(
-        self, low: LowLevelConfig, landing: Landing | None, config: HighLevelConfig
-    ) -> None:
-        self._low, self._landing, self._ranges = low, landing, low.commands
+    def __init__(self, low: LowLevelConfig, skill: Skill, config: HighLevelConfig) -> None:
+        self._low, self._landing, self._ranges = low, skill.landing, low.commands
+        self._leap_speed = skill.manner.leap_speed
+        uneven = skill.uneven
+        self._styles = {
+            **STYLES,
+            "rough": uneven,
+            "pillar": dataclasses.replace(uneven, speed=CAREFUL),
+            "stair": uneven,
+        }
         self._dt = config.decimation * low.physics.control_dt
         self._points = PROBES[config.probes]
         self._ahead = self._points[:, 1] == 0.0
@@ -109,7 +113,8 @@ class CuesLaw:
         bearing = np.arctan2(cue["goal"][:, 2], cue["goal"][:, 1])
         if state is None:
             told = [SEMANTIC[k] for k in cue["family"].argmax(axis=1)]
-            state = Memory(self._low, told, distance, bearing)
+            plan = LeapPlan(len(told), self._ranges, _CLEAR, self._leap_speed)
+            state = Memory(plan, told, distance, bearing)
         else:
             velocity = state.command[:, [INDEX["vx"], INDEX["vy"]]]
             state.where.move(distance, bearing, velocity, self._dt)
@@ -149,7 +154,7 @@ class CuesLaw:
 
     def _walk(self, memory: Memory, distance: Array, bearing: Array) -> Array:
         """Return commands (M, 15) to the goal, around pillars, in the style of the family."""
-        styles = [STYLES.get(name, UNKNOWN) for name in memory.told]
+        styles = [self._styles.get(name, UNKNOWN) for name in memory.told]
         command = np.array([style.command() for style in styles])
         fast = np.array([style.speed for style in styles])
         fast[memory.pillar] = CAREFUL
@@ -192,11 +197,12 @@ class CuesLaw:
         if leaping:
             rows = np.array(leaping)
             leaps = memory.command[rows]
-            steer_leap(leaps, heading[rows] + bearing[rows], heading[rows], self._ranges)
+            ways = heading[rows] + bearing[rows], heading[rows]
+            steer_leap(leaps, *ways, self._ranges, self._leap_speed)
             # In trot and pronk the right front foot's raw phase is the gait clock.
             phase = np.arctan2(cue["clock"][rows, 1], cue["clock_cosine"][rows, 1])
             clock = raw_phase(np.mod(phase / (2.0 * np.pi), 1.0), before[rows, INDEX["duration"]])
-            commanded = np.full(len(rows), min(SPEED, self._ranges.vx[1]))
+            commanded = np.full(len(rows), min(self._leap_speed, self._ranges.vx[1]))
             stride = before[rows][:, [INDEX["frequency"], INDEX["stance_length"]]].T
             motion = Motion(x[rows], speed[rows], commanded, clock, *stride)
             leap_command(leaps, *memory.plan.steps(rows, motion, landing))

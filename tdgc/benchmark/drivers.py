@@ -25,10 +25,9 @@ from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.tasks.approach import Approach
 from tdgc.tasks.high_observation import SEMANTIC, Seen, high_layout
-from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import paired
 from tdgc.tasks.probes import PROBES, HeightProbes
-from tdgc.tasks.teacher import Teacher, toward
+from tdgc.tasks.teacher import Skill, Teacher, toward
 
 
 class Driver(ABC):
@@ -127,19 +126,18 @@ class TeacherDriver(Driver):
     can do under good commands.
 
     Args:
-        low: the low policy; its landings are measured first.
         config: the MDP of the low policy.
+        skill: of the low policy.
     """
 
-    def __init__(self, low: Policy, config: LowLevelConfig) -> None:
+    def __init__(self, config: LowLevelConfig, skill: Skill) -> None:
         self.config = HighLevelConfig(cues="none")
-        self._landing = measure_landing(low, config)
-        self.bounds = config.commands
+        self._skill, self.bounds = skill, config.commands
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal, self.told = loco, goal, family
         assert loco.world.field is not None  # episodes run on tiles
-        self._teacher = Teacher(loco.world.field, self.bounds, self._landing)
+        self._teacher = Teacher(loco.world.field, self.bounds, self._skill)
         expects = np.full(loco.num_robots, family == "gap")
         self._teacher.begin(np.arange(loco.num_robots), goal, expects)
 

@@ -26,6 +26,7 @@ from tdgc.config.training import (
     LowTrainConfig,
     PPOConfig,
     RecurrentPPOConfig,
+    TeacherConfig,
 )
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "Range",
     "RecurrentPPOConfig",
     "RobotConfig",
+    "TeacherConfig",
     "from_dict",
     "read_json",
     "recorded",

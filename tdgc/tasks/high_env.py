@@ -26,14 +26,13 @@ from tdgc.tasks.approach import Approach
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, Seen, high_layout, high_spaces
-from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, has_failed, outcome
 from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
-from tdgc.tasks.teacher import WAY, Teacher
+from tdgc.tasks.teacher import WAY, Skill, Teacher
 from tdgc.tasks.tiles import TrainingTiles, shallow
 
 
@@ -98,11 +97,11 @@ class NavigationTask:
         seed: seed of everything random in the task.
         training: draw disturbances and let the curriculum change levels.
         visual: keep what rendering needs.
-        taught: append a teacher's guidance to the observation, see ``tdgc.learn.imitation``: its
-            actions, a second way around obstacles, and the prices of strides.
+        taught: what a teacher has to know of the low policy, to append its guidance to the
+            observation, see ``tdgc.learn.imitation``: its actions, a second way around obstacles,
+            and the prices of strides. None: no teacher.
         led: number of decisions per robot over which the share of episodes that the teacher drives
             falls from all to none.
-        landing: where the low policy's feet land in leaps, for the teacher.
         first: number of the first robot among those of the run; families are dealt by number.
     """
 
@@ -114,9 +113,8 @@ class NavigationTask:
         seed: int,
         training: bool = True,
         visual: bool = False,
-        taught: bool = False,
+        taught: Skill | None = None,
         led: float = 0.0,
-        landing: Landing | None = None,
         first: int = 0,
     ) -> None:
         self.low, self.low_config = load_low(low)
@@ -156,13 +154,13 @@ class NavigationTask:
         self._commands = np.zeros((3, m, 15))
         self.stats = Sums()
         self.teacher = None
-        if taught:
+        if taught is not None:
             assert config.commands is not None  # ``paired`` has set them
-            self.teacher = Teacher(self.field, config.commands, landing)
+            self.teacher = Teacher(self.field, config.commands, taught)
         self._lead, self._decisions = led, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
-        self.observation_space, self.action_space = high_spaces(config, taught)
+        self.observation_space, self.action_space = high_spaces(config, taught is not None)
 
     def _build_robots(self) -> None:
         self.tiles.draw(np.arange(self.num_robots), self.curriculum.levels)

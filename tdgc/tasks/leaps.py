@@ -180,12 +180,15 @@ class LeapPlan:
         num_robots: M.
         ranges: command ranges of the leaps.
         clear: m from a lip, beyond which a foot is safe.
+        speed: m/s, commanded.
     """
 
-    def __init__(self, num_robots: int, ranges: CommandRanges, clear: float = CLEAR) -> None:
+    def __init__(
+        self, num_robots: int, ranges: CommandRanges, clear: float = CLEAR, speed: float = SPEED
+    ) -> None:
         low, high = ranges.stance_length
         self._clear = clear
-        self._speed = min(SPEED, ranges.vx[1])
+        self._speed = min(speed, ranges.vx[1])
         self._lengths = np.linspace(low, high, LENGTHS)
         self._frequencies = np.linspace(*ranges.frequency, FREQUENCIES)
         self._x = _STEP * np.arange(1 + round(TILE_SIZE / _STEP))
@@ -276,7 +279,9 @@ def leap_command(command: Array, frequency: ArrayLike, length: ArrayLike) -> Non
     command[:, 12:] = gait_embedding(GAITS.index("pronk"))
 
 
-def steer_leap(command: Array, bearing: Array, heading: Array, ranges: CommandRanges) -> None:
+def steer_leap(
+    command: Array, bearing: Array, heading: Array, ranges: CommandRanges, speed: float = SPEED
+) -> None:
     """Set the velocities of commands (n, 15) of leaps, in place.
 
     The robots face straight across the trenches, so that both feet of a pair land on one line, and
@@ -286,9 +291,10 @@ def steer_leap(command: Array, bearing: Array, heading: Array, ranges: CommandRa
         command: changed in place.
         bearing, heading: (n,) rad, of the goal and the robots, from straight across the trenches.
         ranges: bounds of the velocities.
+        speed: m/s.
     """
     wanted = (
-        ("vx", SPEED * np.cos(bearing - heading)), ("vy", SPEED * np.sin(bearing - heading)),
+        ("vx", speed * np.cos(bearing - heading)), ("vy", speed * np.sin(bearing - heading)),
         ("yaw_rate", -_TURN * heading),
     )  # fmt: skip
     for name, value in wanted:
@@ -301,12 +307,13 @@ _STANDING = 0.5  # least share of robots still up after the measurement if the p
 _RATE = 0.02  # weight of a landing: after 180 of them 3 % of the initial estimate is left
 
 
-def measure_landing(low: "Policy", config: LowLevelConfig) -> Landing | None:
+def measure_landing(low: "Policy", config: LowLevelConfig, speed: float = SPEED) -> Landing | None:
     """Measure where ``low`` lands when it leaps on a plane, with strides of 0.32 m to ``LONGEST``.
 
     Args:
         low: the low policy.
         config: its configuration.
+        speed: m/s, commanded.
 
     Returns:
         The landing; None for a policy that cannot leap, with most robots fallen.
@@ -314,7 +321,7 @@ def measure_landing(low: "Policy", config: LowLevelConfig) -> Landing | None:
     loco = Locomotion(_ROBOTS, config.robot, config.physics, None, config.gyro)
     rows, dt = np.arange(_ROBOTS), config.physics.control_dt
     stride = np.linspace(0.32, LONGEST, _ROBOTS)
-    loco.command[:, INDEX["vx"]] = speed = min(SPEED, config.commands.vx[1])
+    loco.command[:, INDEX["vx"]] = speed = min(speed, config.commands.vx[1])
     length = np.clip(stride, *config.commands.stance_length)
     leap_command(loco.command, np.clip(speed / stride, *config.commands.frequency), length)
     places = np.column_stack([np.zeros(_ROBOTS), 2.0 * rows])

@@ -9,12 +9,12 @@ they take pronk at nearly full speed with steps timed to a few centimetres, whic
 starts from a trot does not find.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.config import CommandRanges
+from tdgc.config import CommandRanges, TeacherConfig
 from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, wrap_angle
@@ -69,7 +69,7 @@ class Style:
 
 
 # Values other than Walk These Ways' defaults are from docs/experiments.md.
-#: Style on steps and bumps, and wherever there is no reason for another.
+#: Style on steps and bumps; speed and frequency depend on the low policy, see ``Skill``.
 UNEVEN = Style(
     0.6,
     frequency=2.3,
@@ -85,6 +85,27 @@ CAREFUL = 0.5
 SLOPING = Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45)
 #: Style of leaps, in pronk, see ``tdgc.tasks.leaps``.
 LEAPING = Style(SPEED, stance_width=0.3, body_height=0.02, pitch=-0.1)
+
+
+@dataclass(frozen=True)
+class Skill:
+    """What the teacher has to know of the low policy that it commands.
+
+    Attributes:
+        landing: where its feet land in leaps; None for a policy that cannot leap, which walks over
+            trenches.
+        manner: how it is best commanded.
+    """
+
+    landing: Landing | None = None
+    manner: TeacherConfig = field(default_factory=TeacherConfig)
+
+    @property
+    def uneven(self) -> Style:
+        """Style on steps and bumps, and wherever there is no reason for another."""
+        manner = self.manner
+        return replace(UNEVEN, speed=manner.walk_speed, frequency=manner.step_frequency)
+
 
 #: m ahead at which the probes see a trench; they reach 1.2 m.
 SIGHT = 1.15
@@ -126,7 +147,7 @@ class Teacher:
     Args:
         field: (M, 1) tiles.
         ranges: command ranges that the low policy was trained on.
-        landing: the low policy's; None for one that cannot leap, which walks over trenches.
+        skill: of the low policy.
 
     Attributes:
         speed: (M,) m/s forward, an estimate from how leaps speed up and from the speeds seen.
@@ -139,11 +160,11 @@ class Teacher:
             obstacles.
     """
 
-    def __init__(self, field: TileField, ranges: CommandRanges, landing: Landing | None) -> None:
+    def __init__(self, field: TileField, ranges: CommandRanges, skill: Skill) -> None:
         m = field.shape[0]
-        self._field, self._ranges, self._landing = field, ranges, landing
+        self._field, self._ranges, self._landing = field, ranges, skill.landing
         self._origin = field.origin(np.arange(m), 0)
-        commands = np.array([style.command() for style in (UNEVEN, SLOPING, LEAPING)])
+        commands = np.array([style.command() for style in (skill.uneven, SLOPING, LEAPING)])
         # The low policy may have been trained on narrower ranges than the styles use.
         bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
         behaviour = commands[:, : len(CONTINUOUS)]
@@ -155,8 +176,9 @@ class Teacher:
         self.dearer = np.zeros(m)
         self._slope = np.zeros((m, TILE_SAMPLES, field.heights.shape[1]))
         self._costs: dict[int, Array] = {}  # of travelling, on tiles with obstacles
-        self._plan = LeapPlan(m, ranges)
-        self._leap_speed = min(SPEED, ranges.vx[1])
+        self._walk_speed, self._wanted_speed = skill.manner.walk_speed, skill.manner.leap_speed
+        self._plan = LeapPlan(m, ranges, speed=self._wanted_speed)
+        self._leap_speed = min(self._wanted_speed, ranges.vx[1])
         self._start = np.full(m, -np.inf)  # m, x where a robot starts to leap
         self._end = np.full(m, -np.inf)  # m, x where a robot stops leaping
 
@@ -207,7 +229,7 @@ class Teacher:
         slope = self._slope_at(local)
         sloping = slope != 0.0
         command = np.where(sloping[:, None], self._sloping, self._uneven)
-        top_speed = np.where(sloping, SLOPING.speed, UNEVEN.speed)
+        top_speed = np.where(sloping, SLOPING.speed, self._walk_speed)
         top_speed[detour] = CAREFUL
         climb = SLOPING.uphill * np.sin(np.arctan(slope))
         self.other = command.copy()
@@ -217,7 +239,8 @@ class Teacher:
         rows = np.flatnonzero((local[:, 0] >= self._start) & (local[:, 0] < self._end))
         if rows.size and self._landing is not None:
             leaps = np.tile(self._leap, (len(rows), 1))
-            steer_leap(leaps, bearing[rows], state.yaw[rows], self._ranges)
+            ways = bearing[rows], state.yaw[rows]
+            steer_leap(leaps, *ways, self._ranges, self._wanted_speed)
             commanded = np.full(len(rows), self._leap_speed)
             stride = loco.command[rows][:, [INDEX["frequency"], INDEX["stance_length"]]].T
             clock = loco.clock.clock[rows]
