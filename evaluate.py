@@ -32,7 +32,14 @@ from tdgc.benchmark.results import FILES, STOPS, describe, salvage, what_stopped
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
-from tdgc.config import HighLevelConfig, LowLevelConfig, TeacherConfig, recorded
+from tdgc.config import (
+    FIRST_TEACHER,
+    ConfigError,
+    HighLevelConfig,
+    LowLevelConfig,
+    TeacherConfig,
+    recorded,
+)
 from tdgc.errors import InputError, require
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
@@ -43,6 +50,7 @@ from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.world import WindowError
 from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.manners import find_manner
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.teacher import Skill
 
@@ -222,11 +230,19 @@ class Evaluation:
         return run_jobs if self.cluster is None else cluster.run_jobs
 
     def skill(self, low: Policy, config: LowLevelConfig) -> Skill:
-        """What the scripts have to know of the low policy. They command it like the teacher of the
-        high policy."""
-        taught = None if self.high is None else load(self.high).meta.get("teacher")
-        manner = TeacherConfig()
-        if taught is not None:
+        """What the scripts have to know of the low policy.
+
+        They command it as the teacher of the high policy did. Without a high policy that fits, what
+        suits the low policy is tried out.
+        """
+        try:
+            if self.high is None:
+                raise ConfigError("there is no high policy")
+            taught = load_high(self.high, low, config)[0].meta.get("teacher", FIRST_TEACHER)
+        except ConfigError as error:
+            print(f"{error}: trying out how the low policy walks and leaps best")
+            manner = find_manner(low, HighLevelConfig(), print)
+        else:
             manner = recorded(TeacherConfig, taught, f"{self.high}, meta.teacher")
         return Skill(measure_landing(low, config, manner.leap_speed), manner)
 
@@ -240,14 +256,17 @@ class Evaluation:
         if self.mode == "tracking":
             return {}
         drivers: dict[str, Driver] = {}
+        skill = self.skill(low, config) if {CUES, TEACHER} & set(self.policies) else None
         for name in self.policies:
             if name == "gp":
                 drivers[name] = BaselineDriver(bounds=config.commands)
             elif name == TEACHER:
-                drivers[name] = TeacherDriver(config, self.skill(low, config))
+                assert skill is not None
+                drivers[name] = TeacherDriver(config, skill)
             elif name == CUES:
                 mdp = HighLevelConfig(commands=config.commands)
-                law = CuesLaw(config, self.skill(low, config), mdp)
+                assert skill is not None
+                law = CuesLaw(config, skill, mdp)
                 drivers[name] = HierarchyDriver(law, mdp)
             else:
                 assert self.high is not None

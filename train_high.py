@@ -20,11 +20,14 @@ from tqdm import tqdm
 
 from tdgc import __version__, policies
 from tdgc.config import (
+    FIRST_TEACHER,
     NO_TEACHER,
     PRESETS,
     ConfigError,
     HighLevelConfig,
     HighTrainConfig,
+    TeacherConfig,
+    recorded,
     to_dict,
     with_overrides,
 )
@@ -51,10 +54,10 @@ from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.manners import find_manner
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.teacher import Skill
 from tdgc.tasks.tiles import check_families, check_levels
-from tdgc.tasks.trials import suit
 
 # Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
 # the apprentice alone drives, so that it learns in the states to which its own actions lead.
@@ -90,13 +93,26 @@ def pin_low(config: HighTrainConfig) -> HighTrainConfig:
     return dataclasses.replace(config, low_sha256=found)
 
 
-def with_teacher(config: HighTrainConfig, low: Policy) -> HighTrainConfig:
-    """Add how the teacher best commands the low policy, if there is a teacher and it is not set."""
+def with_manner(config: HighTrainConfig, low: Policy, init: Path | None) -> HighTrainConfig:
+    """Add how the teacher commands the low policy, unless it is set or there is no teacher.
+
+    It is found by trials; a policy ``init`` that training begins from hands on that of its own
+    teacher.
+
+    Raises:
+        PolicyFileError, ConfigError: ``init`` cannot be read.
+    """
     imitation = config.imitation
-    if not imitation.steps or imitation.teacher is not None:
+    if imitation.teacher is not None:
         return config
-    found = suit(low, any(map(may_have_trenches, config.env.families)), tqdm.write)
-    return dataclasses.replace(config, imitation=dataclasses.replace(imitation, teacher=found))
+    if init is not None:
+        taught = policies.load(init).meta.get("teacher", FIRST_TEACHER)
+        manner = recorded(TeacherConfig, taught, f"{init}, meta.teacher")
+    elif imitation.steps:
+        manner = find_manner(low, config.env, tqdm.write)
+    else:
+        return config
+    return dataclasses.replace(config, imitation=dataclasses.replace(imitation, teacher=manner))
 
 
 def start_action(config: HighTrainConfig) -> Array:
@@ -136,7 +152,7 @@ def make_env(
     env_config, skill = config.env, None
     if taught:
         landing, manner = None, config.imitation.teacher
-        assert manner is not None  # ``with_teacher`` has set it
+        assert manner is not None  # ``with_manner`` has set it
         if any(map(may_have_trenches, env_config.families)):
             landing = measure_landing(*load_low(low), manner.leap_speed)
             if landing is None:
@@ -335,7 +351,8 @@ def main(arguments: list[str] | None = None) -> int:
         check_randomisation(config.env.randomisation, low_config.physics, trunk)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check(config)
-        config = with_teacher(config, low)
+        interruption = Interruption(args.time_limit)
+        config = with_manner(config, low, args.init)
         meta: dict[str, Any] = {
             "config": to_dict(config.env),
             "low": {"config": to_dict(low_config), "observation": low.actor_dim},
@@ -346,7 +363,7 @@ def main(arguments: list[str] | None = None) -> int:
         if config.imitation.teacher is not None:
             meta["teacher"] = to_dict(config.imitation.teacher)
         run = Run(
-            args.out, config, meta, summarise, Interruption(args.time_limit), args.worker_timeout,
+            args.out, config, meta, summarise, interruption, args.worker_timeout,
             worker_link(args), args.init,
         )  # fmt: skip
         run.train(phases(config, low, args.device), args.resume)

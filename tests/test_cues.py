@@ -15,7 +15,7 @@ from tdgc.config import HighLevelConfig
 from tdgc.sim.commands import INDEX
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, START_X
-from tdgc.tasks.leaps import Landing, LeapPlan, Motion, measure_landing
+from tdgc.tasks.leaps import SPEED, Landing, LeapPlan, Motion, measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES
 from tdgc.tasks.teacher import Skill
@@ -112,9 +112,8 @@ class Watched(CuesLaw):
 
 @pytest.fixture(scope="module")
 def law() -> Watched:
-    return Watched(
-        CONFIG, Skill(measure_landing(LOW, CONFIG)), HighLevelConfig(commands=CONFIG.commands)
-    )
+    skill = Skill(measure_landing(LOW, CONFIG, SPEED))
+    return Watched(CONFIG, skill, HighLevelConfig(commands=CONFIG.commands))
 
 
 def run(law: CuesLaw, condition: str, family: str, level: int, count: int) -> list[str]:

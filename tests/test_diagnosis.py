@@ -25,7 +25,7 @@ from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, TeacherDrive
 from tdgc.benchmark.evaluation import Cell, Episode, run_cell, tile_of
 from tdgc.benchmark.planted import Blindfold, SwappedBounds, WeakMotor, measured_limits
 from tdgc.benchmark.trace import COLUMNS, Trace, Tracer
-from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.leaps import SPEED, measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import NUM_PROBES
 from tdgc.tasks.teacher import Skill
@@ -232,7 +232,7 @@ def test_the_baseline_is_not_blamed_on_the_low_level_in_gap(low):
 
 
 def test_the_teacher_is_not_blind(low):
-    driver = TeacherDriver(low[1], Skill(measure_landing(*low)))
+    driver = TeacherDriver(low[1], Skill(measure_landing(*low, SPEED)))
     tracer = Tracer(driver, planted.SEED)
     run_cell(Cell("teacher", "nominal", "gap", 4, 0, 1), low[0], driver, planted.SEED, [tracer])
     (trace,) = tracer.traces()

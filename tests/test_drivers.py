@@ -13,8 +13,10 @@ import torch as th
 from gymnasium import spaces
 
 from tdgc import policies
+from tdgc.benchmark.cues import CuesLaw
 from tdgc.benchmark.drivers import (
     BaselineDriver,
+    Driver,
     GoToGoal,
     HierarchyDriver,
     TeacherDriver,
@@ -27,6 +29,7 @@ from tdgc.config import (
     LowLevelConfig,
     PhysicsConfig,
     RandomisationConfig,
+    TeacherConfig,
     to_dict,
 )
 from tdgc.learn.recurrent import FastRecurrentPolicy
@@ -38,7 +41,7 @@ from tdgc.sim.robot import Array
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, Seen, high_layout
-from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.leaps import SPEED, Landing, measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 from tdgc.tasks.teacher import Skill
@@ -155,7 +158,8 @@ def test_baseline_keeps_to_the_ranges_that_it_is_given(low):
 @pytest.mark.parametrize("family", ["gap", "stair"])
 def test_the_teacher_drives_as_it_teaches(low, family):
     """Its commands are those that the student is shown, held for a decision."""
-    config, skill = dataclasses.replace(CONFIG, families=(family,)), Skill(measure_landing(*low))
+    config = dataclasses.replace(CONFIG, families=(family,))
+    skill = Skill(measure_landing(*low, SPEED))
     task = NavigationTask(config, LOW, 2, seed=4, training=False, taught=skill)
     try:
         task.reset(np.arange(2))
@@ -171,6 +175,27 @@ def test_the_teacher_drives_as_it_teaches(low, family):
             np.testing.assert_allclose(driver.command(step), taught, atol=1e-6)
             executor.step(taught)
         assert (gait_index(taught) == (1 if family == "gap" else 0)).all()  # pronk, trot
+    finally:
+        task.close()
+
+
+@pytest.mark.parametrize("script", ["teacher", "cues"])
+def test_scripts_leap_at_the_speed_that_suits_the_low_policy(low, script):
+    skill = Skill(Landing(), TeacherConfig(leap_speed=0.9))
+    task = NavigationTask(
+        dataclasses.replace(CONFIG, families=("gap",)), LOW, 2, seed=4, training=False
+    )
+    try:
+        task.reset(np.arange(2))
+        driver: Driver = TeacherDriver(low[1], skill)
+        if script == "cues":
+            config = HighLevelConfig(commands=low[1].commands)
+            driver = HierarchyDriver(CuesLaw(low[1], skill, config), config)
+        driver.begin(task.locomotion, task.goal, "gap")
+        command = driver.command(0)
+        velocity = command[:, [INDEX["vx"], INDEX["vy"]]]
+        np.testing.assert_allclose(np.hypot(*velocity.T), 0.9, atol=0.01)
+        assert (gait_index(command) == 1).all()  # pronk
     finally:
         task.close()
 

@@ -186,7 +186,7 @@ def test_the_command_of_a_leap() -> None:
 
 
 def test_landing_of_the_shipped_low_policy() -> None:
-    found = measure_landing(*load_low(LOW))
+    found = measure_landing(*load_low(LOW), SPEED)
     assert found is not None
     assert -0.08 < found.front < 0.02 and -0.03 < found.spread < 0.12
     assert found != Landing()
@@ -217,7 +217,7 @@ def test_a_robot_that_blew_up_teaches_no_landing() -> None:
 
 def test_a_low_policy_that_falls_has_no_landing() -> None:
     _, config = load_low(LOW)
-    assert measure_landing(Flail(), config) is None  # type: ignore[arg-type]
+    assert measure_landing(Flail(), config, SPEED) is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("choice", ["steps", "lesson"])
@@ -243,7 +243,7 @@ def test_leaps_lead_to_the_goal_whatever_the_heading() -> None:
     """Velocities are commanded in the heading frame."""
     bearing, heading = np.array([0.3, -0.1, 0.1]), np.array([0.4, 0.3, -0.3])
     command = np.zeros((3, 15))
-    steer_leap(command, bearing, heading, CommandRanges())
+    steer_leap(command, bearing, heading, CommandRanges(), SPEED)
     velocity = command[:, [INDEX["vx"], INDEX["vy"]]]
     np.testing.assert_allclose(np.hypot(*velocity.T), SPEED)
     np.testing.assert_allclose(np.arctan2(*velocity.T[::-1]) + heading, bearing, atol=1e-12)

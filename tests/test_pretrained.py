@@ -59,7 +59,8 @@ def test_the_high_policy_was_trained_with_the_defaults() -> None:
     path = PRETRAINED / "high_run" / "config.json"
     # A setting that came later has the value that the run had without it.
     run = recorded(HighTrainConfig, read(path), path)
-    assert run.imitation.teacher == TeacherConfig()  # what trials of the shipped low policy find
+    # It is older than the trials. They find the same for the shipped low policy.
+    assert run.imitation.teacher == TeacherConfig()
     imitation = dataclasses.replace(run.imitation, teacher=None)
     assert dataclasses.replace(run, imitation=imitation) == config
     meta = policies.load(PRETRAINED / "high").meta

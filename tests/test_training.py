@@ -27,10 +27,12 @@ import train_high
 import train_low
 from tdgc import calibration, policies
 from tdgc.config import (
+    FIRST_TEACHER,
     CalibrationConfig,
     HighTrainConfig,
     LowTrainConfig,
     PPOConfig,
+    TeacherConfig,
     from_dict,
     to_dict,
     with_overrides,
@@ -441,11 +443,13 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         "--set", "ppo.lstm=8",
         "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.7",
         "--set", "imitation.steps=16", "--set", "imitation.levels_after=hardest",
-        "--set", "imitation.kept=2", "--set", "imitation.teacher.walk_speed=0.6",
+        "--set", "imitation.kept=2",
         "--set", 'env.families=["rough","pillar"]',
     ]  # fmt: skip
     monkeypatch.chdir(ROOT)  # where ``kill_run`` starts the resumed run
     whole, broken = tmp_path / "whole", tmp_path / "broken"
+    manner, trials = TeacherConfig(walk_speed=0.5), []
+    monkeypatch.setattr(train_high, "find_manner", lambda *_: trials.append(None) or manner)
     assert (
         train_high.main([*arguments, "--out", str(whole), "--set", "checkpoint_seconds=1e6"]) == 0
     )
@@ -453,6 +457,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     # The policy at the end of imitation is kept beside the final one.
     imitated, learned = (policies.load(whole / name) for name in ("imitation", "policy"))
     assert (imitated.meta["steps"], learned.meta["steps"]) == (16, 40)
+    assert imitated.meta["teacher"] == learned.meta["teacher"] == to_dict(manner)
     # Imitation draws levels at random. Afterwards all start at the hardest, and none has moved yet.
     assert [rows(whole)[1][f"level/{family}"] for family in ("rough", "pillar")] == [10.0, 10.0]
     # In imitation, halfway from 2e-3 to 2e-4. Then, on the way from 1.5e-4 to 5e-5, after 24 of 40
@@ -482,6 +487,28 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert cut.tensors["lstm.pi.h"].any()
     assert train_high.main(["--resume", "--out", str(broken)]) == 0
     assert final(broken) == final(whole)
+    assert len(trials) == 2  # at the start of each run, not when it is resumed
+
+
+def test_the_manner_of_the_teacher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It is found by trials, set, or that of the policy that training begins from."""
+    found, low = TeacherConfig(walk_speed=0.5), policies.load(PRETRAINED / "low")
+    monkeypatch.setattr(train_high, "find_manner", lambda *_: found)
+    config = HighTrainConfig()
+
+    def manner(config: HighTrainConfig, init: Path | None = None) -> TeacherConfig | None:
+        return train_high.with_manner(config, low, init).imitation.teacher
+
+    alone = with_overrides(config, ["imitation.steps=0"])
+    own = with_overrides(config, ["imitation.teacher.leap_speed=1.1"])
+    assert (manner(config), manner(alone)) == (found, None)
+    assert manner(own) == TeacherConfig(leap_speed=1.1)
+    # The shipped policy is older than the trials.
+    assert manner(alone, PRETRAINED / "high") == TeacherConfig(**FIRST_TEACHER)
+    high = policies.load(PRETRAINED / "high")
+    taught = {**high.meta, "teacher": to_dict(TeacherConfig(leap_speed=1.0))}
+    policies.save_copy(tmp_path / "high", high, high.actor.tensors(), taught)
+    assert manner(alone, tmp_path / "high") == TeacherConfig(leap_speed=1.0)
 
 
 def test_from_scratch_on_terrain_of_ones_own(

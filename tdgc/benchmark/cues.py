@@ -1,8 +1,8 @@
 """A scripted law on the high policy's cues, to separate what learning adds from what the cues give.
 
 ``CuesLaw`` stands in for the high policy. It gets the same observation o^H and nothing else, except
-the benchmark's constants (where starts and goals lie along a tile) and where the low policy lands
-when it leaps.
+the benchmark's constants (where starts and goals lie along a tile), and how fast the low policy
+walks, steps and leaps best and where it lands.
 """
 
 import dataclasses
@@ -20,17 +20,10 @@ from tdgc.sim.terrain import GOAL_X, ZONE
 from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
 from tdgc.tasks.leaps import BEYOND, Landing, LeapPlan, Motion, leap_command, steer_leap
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
-from tdgc.tasks.teacher import CAREFUL, LEAPING, SLOPING, UNEVEN, Skill, Style, toward
+from tdgc.tasks.teacher import CAREFUL, LEAPING, SLOPING, Skill, Style, toward
 
-#: How to walk on each family.
-STYLES = {
-    "rough": UNEVEN,
-    "pillar": dataclasses.replace(UNEVEN, speed=CAREFUL),
-    "stair": UNEVEN,
-    "gap": LEAPING,
-    "tilt": SLOPING,
-}
-#: How to walk where the family is unknown: a compromise for rough ground, stairs and slopes.
+#: How to walk where the family is unknown: a compromise for rough ground, stairs and slopes, with
+#: any low policy.
 UNKNOWN = Style(0.6, frequency=3.2, swing_height=0.2, stance_width=0.33, uphill=0.45)
 
 # m, clearance that a foothold should keep from a lip, whose position is known to about 5 cm. Of 20
@@ -44,6 +37,17 @@ _DEEP = -0.3
 _TALL = 0.35  # m above the surrounding ground: a pillar, provided that there are no stairs
 _GROUND = 0.3  # m, a probe further than this from the standing height does not see that ground
 _WIDEST = 0.35  # m, assumed width of a trench whose end is out of sight: lip to lip at level 10
+
+
+def styles(skill: Skill) -> dict[str, Style]:
+    """How to walk on each family with a low policy of this ``skill``."""
+    return {
+        "rough": skill.uneven,
+        "pillar": dataclasses.replace(skill.uneven, speed=CAREFUL),
+        "stair": skill.uneven,
+        "gap": dataclasses.replace(LEAPING, speed=skill.manner.leap_speed),
+        "tilt": SLOPING,
+    }
 
 
 class Memory:
@@ -88,15 +92,8 @@ class CuesLaw:
     """
 
     def __init__(self, low: LowLevelConfig, skill: Skill, config: HighLevelConfig) -> None:
-        self._low, self._landing, self._ranges = low, skill.landing, low.commands
-        self._leap_speed = skill.manner.leap_speed
-        uneven = skill.uneven
-        self._styles = {
-            **STYLES,
-            "rough": uneven,
-            "pillar": dataclasses.replace(uneven, speed=CAREFUL),
-            "stair": uneven,
-        }
+        self._landing, self._ranges = skill.landing, low.commands
+        self._styles, self._leap_speed = styles(skill), skill.manner.leap_speed
         self._dt = config.decimation * low.physics.control_dt
         self._points = PROBES[config.probes]
         self._ahead = self._points[:, 1] == 0.0
@@ -154,9 +151,9 @@ class CuesLaw:
 
     def _walk(self, memory: Memory, distance: Array, bearing: Array) -> Array:
         """Return commands (M, 15) to the goal, around pillars, in the style of the family."""
-        styles = [self._styles.get(name, UNKNOWN) for name in memory.told]
-        command = np.array([style.command() for style in styles])
-        fast = np.array([style.speed for style in styles])
+        chosen = [self._styles.get(name, UNKNOWN) for name in memory.told]
+        command = np.array([style.command() for style in chosen])
+        fast = np.array([style.speed for style in chosen])
         fast[memory.pillar] = CAREFUL
         error, goal = bearing.copy(), np.array([GOAL_X, 0.0])
         for i in np.flatnonzero(memory.pillar).tolist():
@@ -165,7 +162,7 @@ class CuesLaw:
             error[i] = wrap_angle(way - heading)
         speed, turn = toward(distance, error, fast, turns=self._ranges.yaw_rate)
         command[:, INDEX["vx"]], command[:, INDEX["yaw_rate"]] = speed, turn
-        uphill = np.array([style.uphill for style in styles]) * np.sin(memory.slope)
+        uphill = np.array([style.uphill for style in chosen]) * np.sin(memory.slope)
         command[:, INDEX["vy"]] = np.clip(uphill, *self._ranges.vy)
         return command
 

@@ -18,6 +18,7 @@ from tdgc.config.settings import (
 )
 from tdgc.config.sim import CommandRanges, PhysicsConfig, RandomisationConfig, RobotConfig
 from tdgc.config.training import (
+    FIRST_TEACHER,
     NO_TEACHER,
     PRESETS,
     CalibrationConfig,
@@ -30,6 +31,7 @@ from tdgc.config.training import (
 )
 
 __all__ = [
+    "FIRST_TEACHER",
     "NO_TEACHER",
     "PRESETS",
     "CalibrationConfig",

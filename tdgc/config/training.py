@@ -1,6 +1,6 @@
 """Settings of a run of train_low.py or train_high.py."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Literal
 
 from tdgc.config.high import HighLevelConfig
@@ -113,14 +113,19 @@ class RecurrentPPOConfig:
 
 @dataclass(frozen=True)
 class TeacherConfig:
-    """How the teacher commands the low policy; the defaults suit the shipped one.
+    """The manner in which the teacher commands the low policy; the defaults suit the shipped one.
 
     What was tried is in docs/experiments.md.
     """
 
     walk_speed: Positive = 0.6  # m/s, on uneven ground
     step_frequency: Positive = 2.3  # Hz, on uneven ground
-    leap_speed: Positive = 1.2  # m/s, over trenches
+    # m/s, over trenches. The plan of strides is made for speeds of 1.0 and above.
+    leap_speed: Positive = 1.2
+
+
+#: The manner of the teachers of runs and policies that do not record one.
+FIRST_TEACHER = {"walk_speed": 0.6, "step_frequency": 2.3, "leap_speed": 1.2}
 
 
 @dataclass(frozen=True)
@@ -128,10 +133,9 @@ class ImitationConfig:
     """Imitation of the scripted teacher, the first phase of train_high.py."""
 
     steps: Whole = 640_000  # decisions over all robots; 0 for reinforcement learning alone
-    # null: tried out with the low policy before training, see ``tdgc.tasks.trials``.
-    teacher: TeacherConfig | None = field(
-        default=None, metadata={"before": asdict(TeacherConfig())}
-    )
+    # null: found by trials with the low policy before training, see ``tdgc.tasks.manners``. If any
+    # of these is set, there are no trials, and the others have their defaults.
+    teacher: TeacherConfig | None = field(default=None, metadata={"before": FIRST_TEACHER})
     learning_rate: Positive = 2e-3
     final_learning_rate: Positive = 2e-4  # reached linearly at the last of these steps
     # With two minibatches, 48 updates per rollout, each on half as many decisions as the rollout

@@ -280,7 +280,7 @@ def leap_command(command: Array, frequency: ArrayLike, length: ArrayLike) -> Non
 
 
 def steer_leap(
-    command: Array, bearing: Array, heading: Array, ranges: CommandRanges, speed: float = SPEED
+    command: Array, bearing: Array, heading: Array, ranges: CommandRanges, speed: float
 ) -> None:
     """Set the velocities of commands (n, 15) of leaps, in place.
 
@@ -307,7 +307,7 @@ _STANDING = 0.5  # least share of robots still up after the measurement if the p
 _RATE = 0.02  # weight of a landing: after 180 of them 3 % of the initial estimate is left
 
 
-def measure_landing(low: "Policy", config: LowLevelConfig, speed: float = SPEED) -> Landing | None:
+def measure_landing(low: "Policy", config: LowLevelConfig, speed: float) -> Landing | None:
     """Measure where ``low`` lands when it leaps on a plane, with strides of 0.32 m to ``LONGEST``.
 
     Args:

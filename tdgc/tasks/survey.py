@@ -42,6 +42,7 @@ _NEAR, _FAR = 5, 10  # samples to both sides over which unevenness and slopes ar
 # Samples along x: robots walk as on a slope from as far away as they can see it, unless there are
 # steps as near.
 _AHEAD = 25
+_SLOPING_ON = {"mode": "reflect", "reflect_type": "odd"}  # ground beyond the tile keeps its slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +160,7 @@ def lateral_slope(heights: Array, steps: Mask) -> Array:
     uneven = np.abs(heights - _mean(_mean(heights, 0, _NEAR), 1, _NEAR))
     for axis in (0, 1):
         uneven = _windows(uneven, axis, _FAR, mode="edge").max(axis=-1)
-    wide = _beyond(heights, 1, _FAR)
+    wide = _padded(heights, 1, _FAR, **_SLOPING_ON)
     slope = _mean((wide[:, 2 * _FAR :] - wide[:, : -2 * _FAR]) / (2 * _FAR * CELL), 0, _FAR)
     steep = np.abs(slope)
     slope[(steep < _LEAST_SLOPE) | (uneven > _UNEVEN * steep)] = 0.0
@@ -171,21 +172,19 @@ def lateral_slope(heights: Array, steps: Mask) -> Array:
 
 def _windows(grid: NDArray[Any], axis: int, n: int, **beyond: Any) -> NDArray[Any]:
     """The ``n`` samples to both sides of each sample along an axis, and itself, (..., 2 n + 1)."""
-    sides = [(0, 0), (0, 0)]
-    sides[axis] = (n, n)
-    return sliding_window_view(np.pad(grid, sides, **beyond), 2 * n + 1, axis)
+    return sliding_window_view(_padded(grid, axis, n, **beyond), 2 * n + 1, axis)
 
 
-def _beyond(grid: Array, axis: int, n: int) -> Array:
-    """A grid continued by ``n`` samples on both ends of an axis, with its slopes."""
+def _padded(grid: NDArray[Any], axis: int, n: int, **beyond: Any) -> NDArray[Any]:
+    """A grid with ``n`` more samples on both ends of an axis; ``beyond`` says which."""
     sides = [(0, 0), (0, 0)]
     sides[axis] = (n, n)
-    return np.pad(grid, sides, mode="reflect", reflect_type="odd")
+    return np.pad(grid, sides, **beyond)
 
 
 def _mean(grid: Array, axis: int, n: int) -> Array:
     """Mean over the ``n`` samples to both sides along an axis."""
-    return np.asarray(sliding_window_view(_beyond(grid, axis, n), 2 * n + 1, axis).mean(axis=-1))
+    return np.asarray(_windows(grid, axis, n, **_SLOPING_ON).mean(axis=-1))
 
 
 def _close(grid: Array, n: int) -> Array:

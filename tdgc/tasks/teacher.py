@@ -3,13 +3,14 @@
 It knows what the high policy has to infer from its cues: where the robot is on the tile, how fast
 it moves, and the heights of the tile. From these it reads obstacles, trenches and slopes
 (``tdgc.tasks.survey``), so it leads on any terrain, a family or a user's map. It is told only
-whether the high policy expects trenches, and then leaps from the start. How to walk was found by
-trials on training tiles (docs/experiments.md). Leaps over trenches show why imitation comes first:
+whether the high policy expects trenches, and then leaps from the start. Its styles were found with
+the shipped low policy (docs/experiments.md); how fast to walk, step and leap is found anew for each
+low policy (``tdgc.tasks.manners``). Leaps over trenches show why imitation comes first:
 they take pronk at nearly full speed with steps timed to a few centimetres, which exploration that
 starts from a trot does not find.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,11 +69,12 @@ class Style:
         return command
 
 
+_USUAL = TeacherConfig()
 # Values other than Walk These Ways' defaults are from docs/experiments.md.
 #: Style on steps and bumps; speed and frequency depend on the low policy, see ``Skill``.
 UNEVEN = Style(
-    0.6,
-    frequency=2.3,
+    _USUAL.walk_speed,
+    frequency=_USUAL.step_frequency,
     swing_height=0.24,
     stance_width=0.32,
     body_height=0.05,
@@ -94,11 +96,11 @@ class Skill:
     Attributes:
         landing: where its feet land in leaps; None for a policy that cannot leap, which walks over
             trenches.
-        manner: how it is best commanded.
+        manner: how fast it walks, steps and leaps best.
     """
 
     landing: Landing | None = None
-    manner: TeacherConfig = field(default_factory=TeacherConfig)
+    manner: TeacherConfig = _USUAL
 
     @property
     def uneven(self) -> Style:

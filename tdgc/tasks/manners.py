@@ -1,0 +1,112 @@
+"""Trials of how fast the teacher should walk, step and leap with a low policy.
+
+What suits depends on the low policy. With the shipped one nothing is better than the usual speeds.
+One of the Unitree A1 falls on the higher stairs and between trenches at these, and needs faster
+walks with faster steps, and slower leaps (docs/experiments.md).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tdgc.config import HighLevelConfig, TeacherConfig
+from tdgc.sim.commands import NUM_ACTIONS
+from tdgc.sim.terrain import MAX_LEVEL, may_have_trenches
+from tdgc.tasks.high_env import NavigationTask
+from tdgc.tasks.leaps import measure_landing
+from tdgc.tasks.pairing import load_low
+from tdgc.tasks.teacher import Skill
+
+if TYPE_CHECKING:
+    from tdgc.policies import Policy
+
+#: Walks that are tried besides the usual one: m/s, and Hz of the steps.
+WALKS = ((0.75, 2.8), (0.9, 3.3))
+#: m/s, speeds of leaps that are tried besides the usual one.
+LEAPS = (1.1, 1.0)
+ROBOTS = 48
+_FIRST = 5  # lowest level; the robots are dealt to it and to those above it
+_SEED = 0
+# How many more of the robots must arrive for something else to be preferred to the usual, so that
+# near ties, which another machine may decide differently, change nothing.
+_BETTER = 5
+
+
+def find_manner(low: "Policy", env: HighLevelConfig, tell: Callable[[str], None]) -> TeacherConfig:
+    """Find out how the teacher best commands ``low`` on stairs and over trenches.
+
+    Leaps are tried only if ``env.families`` may have trenches.
+
+    Args:
+        low: the low policy.
+        env: the MDP in which the teacher decides.
+        tell: is given the result of each trial, a line of text.
+    """
+
+    def climb(manner: TeacherConfig) -> int:
+        arrived = arrivals(low, env, manner, "stair")
+        walk = f"{manner.walk_speed:g} m/s with {manner.step_frequency:g} Hz"
+        tell(f"trial: {arrived} of {ROBOTS} robots climb stairs at {walk}")
+        return arrived
+
+    def leap(manner: TeacherConfig) -> int:
+        arrived = arrivals(low, env, manner, "gap")
+        tell(f"trial: {arrived} of {ROBOTS} robots leap over trenches at {manner.leap_speed:g} m/s")
+        return arrived
+
+    usual = TeacherConfig()
+    others = [
+        dataclasses.replace(usual, walk_speed=speed, step_frequency=frequency)
+        for speed, frequency in WALKS
+    ]
+    best = choose(climb, [usual, *others])
+    if any(map(may_have_trenches, env.families)):
+        others = [dataclasses.replace(best, leap_speed=speed) for speed in LEAPS]
+        best = choose(leap, [best, *others])
+    return best
+
+
+def choose(
+    trial: Callable[[TeacherConfig], int], manners: Sequence[TeacherConfig]
+) -> TeacherConfig:
+    """Choose the manner with which most robots arrive in a trial, the earlier of equals.
+
+    The first, usual one stays unless another is clearly better; if none can be, no other is tried.
+    """
+    usual, *others = manners
+    least = trial(usual) + _BETTER
+    if least > ROBOTS:
+        return usual
+    arrived = [trial(manner) for manner in others]
+    return others[int(np.argmax(arrived))] if max(arrived) >= least else usual
+
+
+def arrivals(
+    low: "Policy", env: HighLevelConfig, manner: TeacherConfig, family: str, robots: int = ROBOTS
+) -> int:
+    """Count the robots that the teacher leads over tiles of levels 5 to 10, always the same."""
+    landing = measure_landing(*load_low(low), manner.leap_speed) if family == "gap" else None
+    config = dataclasses.replace(
+        env,
+        families=(family,),
+        curriculum="performance",
+        levels=MAX_LEVEL + 1,
+        first_level=_FIRST,
+        first_levels=MAX_LEVEL + 1 - _FIRST,
+    )
+    skill = Skill(landing, manner)
+    task = NavigationTask(config, low, robots, _SEED, training=False, taught=skill, led=np.inf)
+    lost = np.zeros(robots, dtype=bool)
+    try:
+        task.reset(np.arange(robots))
+        for _ in range(task.horizon):
+            task.observe()  # the teacher decides
+            _, failed, _ = task.step(np.zeros((robots, NUM_ACTIONS)))
+            lost |= failed & ~task.reached
+            if (lost | task.reached).all():
+                break
+        return int((task.reached & ~lost).sum())
+    finally:
+        task.close()
