@@ -66,15 +66,14 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     groups = add_arguments(parser, "runs/evaluation")
     groups.episodes.add_argument(
-        "--conditions", help=f"all, or of {', '.join(CONDITIONS)} (nominal)"
+        "--conditions", help=f"all, or comma-separated: {', '.join(CONDITIONS)} (nominal)"
     )
     who = groups.policies
     who.add_argument(
         "--policies",
-        help="all, or of tdgc (the hierarchy), gp (the scripted baseline), cues (a script on the "
-        "cues of tdgc) and teacher (the script that tdgc imitated first, which knows the heights "
-        "of the tile); all is tdgc and gp, the default where there is a high policy, shipped or "
-        "given by --high, and otherwise gp",
+        help="comma-separated: tdgc (the hierarchy), gp (the scripted baseline), cues (a script "
+        "that sees what tdgc sees), teacher (the teacher of train_high.py, which knows the heights "
+        "of the tile); all means tdgc,gp (all; gp if there is no high policy)",
     )
     who.add_argument(
         "--low", type=Path, default=PRETRAINED / "low", help="low policy (the shipped one)"

@@ -382,7 +382,9 @@ def test_no_half_file_is_left_behind(watched, tmp_path):
 def test_the_table_in_the_docs_is_the_codes():
     text = (ROOT / "docs" / "trace.md").read_text(encoding="utf-8")
     rows = [line for line in text.split("## Columns")[1].splitlines() if line.startswith("| `")]
-    assert rows == [f"| `{c.name}` | {c.unit or 'name'} | {c.meaning} |" for c in COLUMNS]
+    meanings = [c.meaning.replace("|", "\\|") for c in COLUMNS]
+    wanted = zip(COLUMNS, meanings, strict=True)
+    assert rows == [f"| `{c.name}` | {c.unit or 'name'} | {meaning} |" for c, meaning in wanted]
 
 
 # ------------------------------------------------------------------ the script

@@ -31,7 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
     add("--levels", help="levels, e.g. 6-10 or 0,5,10 (6-10)")
     add(
         "--families",
-        help=f"all, or of {', '.join(ALL_FAMILIES)} and files of heights, FILE{MAP_ENDING} (all)",
+        help=f"comma-separated: {', '.join(ALL_FAMILIES)}, or height maps FILE{MAP_ENDING}; "
+        f"all means {', '.join(FAMILIES)} (all)",
     )
     add("--episodes", type=int, default=100, help="episodes per cell (100)")
     add("--seed", type=int, default=0, help="seed of the tiles (0)")
