@@ -63,7 +63,7 @@ SHIPPED_HIGH = PRETRAINED / "high"
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     groups = add_arguments(parser, "runs/evaluation")
     groups.episodes.add_argument(
         "--conditions", help=f"all, or comma-separated: {', '.join(CONDITIONS)} (nominal)"
@@ -153,7 +153,8 @@ class Evaluation:
         if "tdgc" in self.policies and self.high is None and self.mode != "tracking":
             raise ValueError("no high policy is shipped: give one with --high, or --policies gp")
         self._check_mode()
-        self._check_policies()
+        if self.tuning is not None and "tdgc" not in self.policies:
+            raise ValueError("--tune and --set change tdgc, which is not among the policies")
 
     def _check_mode(self) -> None:
         if self.mode in gui.MODES:
@@ -170,10 +171,6 @@ class Evaluation:
                 raise ValueError(
                     "--tracking is of the low policy alone: no --trace, --tune or --set"
                 )
-
-    def _check_policies(self) -> None:
-        if self.tuning is not None and "tdgc" not in self.policies:
-            raise ValueError("--tune and --set change tdgc, which is not among the policies")
 
     @classmethod
     def of(cls, flags: argparse.Namespace) -> "Evaluation":

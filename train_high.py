@@ -318,7 +318,7 @@ def check(config: HighTrainConfig) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_arguments(parser, "runs/high", HighTrainConfig(), "decisions")
     high = parser.add_argument_group("high policy")
     high.add_argument(

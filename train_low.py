@@ -125,7 +125,7 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
         return
     if not robots:
         meta = {**learned.meta, "calibration": {"robots": 0}}
-        policies.save_copy(out / "policy", learned, learned.actor.tensors(), meta)
+        policies.save_copy(out / "policy", learned, {}, meta)
         return
     with tqdm(desc="calibrating", total=100, bar_format="{desc}: {percentage:3.0f}%|{bar}|") as bar:
 
@@ -142,7 +142,7 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
         except StoppedError:
             interruption.tell(out)
             return
-    policies.save_copy(out / "uncalibrated", learned, learned.actor.tensors(), learned.meta)
+    policies.save_copy(out / "uncalibrated", learned, {}, learned.meta)
     meta = {**learned.meta, "calibration": facts}
     policies.save_copy(out / "policy", learned, student.tensors(), meta)
 
@@ -189,7 +189,7 @@ def build(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_arguments(parser, "runs/low", LowTrainConfig(), "control steps")
     args = parser.parse_args(arguments)
     try:

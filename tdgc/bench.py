@@ -335,7 +335,7 @@ def choose_workers(args: argparse.Namespace) -> int:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m tdgc.bench", description=(__doc__ or "").splitlines()[0]
+        prog="python -m tdgc.bench", description=(__doc__ or "").partition("\n")[0]
     )
     parser.add_argument("--robots", type=int, default=100, help="number of robots (100)")
     parser.add_argument(

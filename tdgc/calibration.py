@@ -377,7 +377,7 @@ def _walk(low: Policy, job: tuple[int, int]) -> tuple[Array, Array]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m tdgc.calibration", description=(__doc__ or "").splitlines()[0]
+        prog="python -m tdgc.calibration", description=(__doc__ or "").partition("\n")[0]
     )
     parser.add_argument(
         "--low", type=Path, required=True, help="low policy, with or without suffix"

@@ -20,7 +20,7 @@ from tdgc.sim.geometry import read_geometry
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m tdgc.diagnose", description=(__doc__ or "").splitlines()[0]
+        prog="python -m tdgc.diagnose", description=(__doc__ or "").partition("\n")[0]
     )
     parser.add_argument("log", type=Path, help="the log, .npz or .csv (docs/deploy.md)")
     parser.add_argument("--export", type=Path, required=True, help="exported folder on the robot")

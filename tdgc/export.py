@@ -407,7 +407,7 @@ def _choose_formats(text: str) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m tdgc.export", description=(__doc__ or "").splitlines()[0]
+        prog="python -m tdgc.export", description=(__doc__ or "").partition("\n")[0]
     )
     parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low policy (shipped)")
     parser.add_argument(

@@ -224,7 +224,7 @@ def show(args: argparse.Namespace, config: "MujocoConfig") -> None:
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
-        prog="python -m tdgc.mujoco", description=(__doc__ or "").splitlines()[0]
+        prog="python -m tdgc.mujoco", description=(__doc__ or "").partition("\n")[0]
     )
     groups = flags.add_arguments(parser, "runs/mujoco")
     groups.policies.add_argument("--export", type=Path, required=True, help="folder of tdgc.export")

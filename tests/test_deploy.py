@@ -206,6 +206,21 @@ def test_it_stands_after_the_goal_and_after_the_horizon(controller: Controller) 
     assert np.array_equal(controller.commands, stand) and not controller.decided
 
 
+def test_the_high_policy_stops_after_the_goal_never_before(folder: Path, tmp_path: Path) -> None:
+    """Also if it is to stop as soon as the goal is reached."""
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    path = tmp_path / "high_interface.json"
+    for seconds, steps in ((2.0, 100), (0.0, 0)):
+        table = json.loads(path.read_text())
+        table["task"]["after_goal"]["keep_deciding"]["value"] = seconds
+        path.write_text(json.dumps(table))
+        controller = Controller(tmp_path, FORM)
+        assert not controller.over(0, None) and controller.over(controller.horizon, None)
+        stopped = [controller.over(40 + step, 40) for step in range(102)]
+        assert stopped.index(True) == steps
+
+
 def test_a_graph_that_is_not_the_exports_is_refused(folder: Path, tmp_path: Path) -> None:
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())

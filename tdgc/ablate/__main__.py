@@ -36,7 +36,7 @@ from tdgc.tasks.pairing import PRETRAINED, load_low
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
-        prog="python -m tdgc.ablate", description=(__doc__ or "").splitlines()[0]
+        prog="python -m tdgc.ablate", description=(__doc__ or "").partition("\n")[0]
     )
     names = ", ".join(variant.name for variant in variants(False))
     parser.add_argument("--only", metavar="NAMES", help=f"comma-separated, of {names} (all)")

@@ -12,7 +12,6 @@ all but a few stretches of episodes that reached their goals.
 
 import csv
 import dataclasses
-import io
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -359,12 +358,10 @@ def to_obstacles(tile: Tile, x: Array, y: Array) -> Array:
 
 def write(diagnoses: Sequence[Diagnosis], path: str | Path) -> None:
     """Write diagnosis.csv atomically, one row per failed episode."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, [f.name for f in dataclasses.fields(Diagnosis)])
-    writer.writeheader()
-    writer.writerows(dataclasses.asdict(d) for d in diagnoses)
-    with atomic(Path(path)) as partial:
-        partial.write_text(text.getvalue(), encoding="utf-8", newline="")
+    with atomic(Path(path)) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(Diagnosis)])
+        writer.writeheader()
+        writer.writerows(dataclasses.asdict(d) for d in diagnoses)
 
 
 def count_failures(

@@ -93,15 +93,15 @@ class BaselineDriver(Driver):
     Commands outside ``bounds`` are clipped, because the law has one setting for all low policies.
 
     Args:
-        law: the script.
         bounds: command ranges that the low policy was trained on; those of ``CommandRanges`` by
             default.
     """
 
-    def __init__(self, law: GoToGoal | None = None, bounds: CommandRanges | None = None) -> None:
-        self.law = law or GoToGoal()
-        self.config = HighLevelConfig(cues="none")
+    law = GoToGoal()
+
+    def __init__(self, bounds: CommandRanges | None = None) -> None:
         self.bounds = bounds or CommandRanges()
+        self.config = HighLevelConfig(cues="none", commands=self.bounds)
         self._decoder = CommandDecoder(self.bounds)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
@@ -131,8 +131,8 @@ class TeacherDriver(Driver):
     """
 
     def __init__(self, config: LowLevelConfig, skill: Skill) -> None:
-        self.config = HighLevelConfig(cues="none")
         self._skill, self.bounds = skill, config.commands
+        self.config = HighLevelConfig(cues="none", commands=self.bounds)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal, self.told = loco, goal, family

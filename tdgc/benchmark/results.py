@@ -47,11 +47,7 @@ def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, A
         condition, family, *_ = where
         tiles = tree.setdefault(condition, {}).setdefault(family, [])
         tiles.append((one, reached[second][where]))
-    for families in tree.values():
-        every = [tile for tiles in families.values() for tile in tiles]
-        families.update({family: difference(tiles) for family, tiles in families.items()})
-        families["mean"] = difference(every)
-    return tree
+    return _with_differences(tree)
 
 
 def sides(episodes: Iterable[Episode]) -> dict[str, Any]:
@@ -66,15 +62,18 @@ def sides(episodes: Iterable[Episode]) -> dict[str, Any]:
     for (policy, family, *_), images in reached.items():
         if len(images) == 2:
             pair = images["mirrored"], images["nominal"]
-            for name in (family, "mean"):
-                tree.setdefault(policy, {}).setdefault(name, []).append(pair)
-    return {
-        policy: {
-            family: difference(families[family])
-            for family in sorted(families, key=lambda name: name == "mean")
-        }
-        for policy, families in tree.items()
-    }
+            tree.setdefault(policy, {}).setdefault(family, []).append(pair)
+    return _with_differences(tree)
+
+
+def _with_differences(tree: dict[str, Any]) -> dict[str, Any]:
+    """Replace pairs of outcomes by their ``difference``: key -> family -> pairs, with "mean" over
+    the families added to each key."""
+    for families in tree.values():
+        every = [pair for pairs in families.values() for pair in pairs]
+        families.update({family: difference(pairs) for family, pairs in families.items()})
+        families["mean"] = difference(every)
+    return tree
 
 
 def success(rows: Sequence[Episode]) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """The low policy alone on a plane: command tracking in each gait, and how often it falls."""
 
-from collections.abc import Callable, Iterator
+import operator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -106,16 +107,12 @@ def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
     return {"falls": falls, "minutes": minutes, "falls_per_10_min": 10.0 * falls / minutes}
 
 
-def _run(measure: Callable[[Policy], dict[str, float]], low: Policy) -> dict[str, float]:
-    return measure(low)
-
-
 def tracking(
     low: Policy, episodes: int, seed: int, workers: int, run: RunJobs = run_jobs
 ) -> dict[str, Any]:
     """Contents of tracking.json: tracking in each gait, and falls; ``run`` executes the jobs."""
     robots = max(1, round(_FALL_SHARE * episodes))
-    jobs = [partial(track_gait, gait=gait, episodes=episodes, seed=seed) for gait in GAITS]
-    jobs.append(partial(count_falls, robots=robots, seed=seed))
-    *gaits, falls = run(partial(_run, low=low), jobs, workers)
+    jobs = [partial(track_gait, low, gait, episodes, seed) for gait in GAITS]
+    jobs.append(partial(count_falls, low, robots, seed))
+    *gaits, falls = run(operator.call, jobs, workers)
     return {"gaits": dict(zip(GAITS, gaits, strict=True)), **falls}

@@ -279,9 +279,9 @@ class Controller:
     def over(self, step: int, reached_at: int | None) -> bool:
         """Whether ``high`` has stopped by ``step``: at the horizon, or ``keep_deciding`` seconds
         after step ``reached_at``, in which the goal was reached, if it was."""
-        since = 0.0 if reached_at is None else (step - reached_at) * self.dt
         keep: float = self._task["after_goal"]["keep_deciding"]["value"]
-        return step >= self.horizon or since >= keep
+        held = reached_at is not None and (step - reached_at) * self.dt >= keep
+        return step >= self.horizon or held
 
     def step(self, readings: dict[str, Array]) -> Array:
         """Run one control step: readings by name, as from ``sense`` -> joint targets, (12,) rad.

@@ -58,7 +58,7 @@ class Interruption:
 
     def __init__(self, time_limit: float | None) -> None:
         self.reason: str | None = None
-        self._deadline = None if time_limit is None else time.monotonic() + time_limit
+        self._deadline = math.inf if time_limit is None else time.monotonic() + time_limit
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
 
@@ -69,9 +69,8 @@ class Interruption:
 
     def due(self) -> bool:
         """Whether the run should stop now."""
-        if self.reason is None and self._deadline is not None:
-            if time.monotonic() > self._deadline:
-                self.reason = "the time limit"
+        if self.reason is None and time.monotonic() > self._deadline:
+            self.reason = "the time limit"
         return self.reason is not None
 
     def tell(self, run: Path) -> None:

@@ -85,11 +85,11 @@ def raw_phase(phase: NDArray[np.floating], duration: NDArray[np.floating]) -> ND
     return np.where(phase < 0.5, stance, swing)
 
 
-def desired_contact(phases: NDArray[np.floating], kappa: float = KAPPA) -> NDArray[np.float64]:
+def desired_contact(phases: NDArray[np.floating]) -> NDArray[np.float64]:
     """Smoothed contact schedule C of each foot: phases (..., 4) -> (..., 4) in [0, 1]."""
-    return normal_cdf(phases, kappa) * (1.0 - normal_cdf(phases - 0.5, kappa)) + normal_cdf(
-        phases - 1.0, kappa
-    ) * (1.0 - normal_cdf(phases - 1.5, kappa))
+    return normal_cdf(phases, KAPPA) * (1.0 - normal_cdf(phases - 0.5, KAPPA)) + normal_cdf(
+        phases - 1.0, KAPPA
+    ) * (1.0 - normal_cdf(phases - 1.5, KAPPA))
 
 
 def swing_profile(phases: NDArray[np.floating]) -> NDArray[np.float64]:

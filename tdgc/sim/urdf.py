@@ -44,10 +44,6 @@ class Part:
     place: Array
     rotation: Array
 
-    def carry(self, joint: Element, link: Element) -> "Part":
-        """The part of ``link``, which ``joint`` fixes to this one."""
-        return Part(link, *self.at(joint))
-
     def at(self, element: Element) -> tuple[Array, Array]:
         """Position and rotation of an element's ``origin`` in the carrying link's frame."""
         place, turn = (numbers(element, "origin", key, "0 0 0") for key in ("xyz", "rpy"))
@@ -291,7 +287,7 @@ def _parts(
                     child = links.pop(link_of(joint, "child"), None)
                     if child is None:
                         raise ConfigError(f"{called(joint)}: its child must be a link of its own")
-                    mine.append(above.carry(joint, child))
+                    mine.append(Part(child, *above.at(joint)))
     if links:
         raise ConfigError(
             f"link {reprlib.repr(next(iter(links)))}: belongs to no leg and is not fixed to the "

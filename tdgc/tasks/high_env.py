@@ -148,8 +148,7 @@ class NavigationTask:
         self._unknown_share = config.unknown_share if semantic else 1.0
         self._untold = np.full(m, not semantic)
         self._next_push = np.zeros(m)
-        disturbed = config.randomisation, self.rng, self.step_seconds
-        self._pushes = Pushes(*disturbed, self._next_push)
+        self._pushes = Pushes(config.randomisation, self.rng, self.step_seconds, self._next_push)
         self._actions = np.zeros((2, m, NUM_ACTIONS))
         self._commands = np.zeros((3, m, 15))
         self.stats = Sums()

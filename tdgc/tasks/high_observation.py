@@ -71,7 +71,9 @@ def _joint_error(seen: Seen) -> Array:
 
 
 _FLIP_ACTION = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in (*CONTINUOUS, "gait")))
-_LAYOUT: tuple[Term[Seen], ...] = (
+_PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
+#: All terms of o^H, in order.
+_TERMS: tuple[Term[Seen], ...] = (
     Term("goal", 3, _goal, mirror=in_place(1.0, 1.0, -1.0)),
     Term("time_left", 1, lambda s: 1.0 - s.time_share[:, None]),
     Term("gravity", 3, lambda s: s.loco.world.state.gravity, mirror=ARROW),
@@ -79,24 +81,25 @@ _LAYOUT: tuple[Term[Seen], ...] = (
     Term("joint_speed", 12, lambda s: s.loco.world.state.qd, SPEED_SCALE, mirror=JOINTS),
     Term("last_action", 13, lambda s: s.last_action, mirror=_FLIP_ACTION),
     Term("clock", 4, lambda s: s.loco.clock.signal(), mirror=LEGS),
+    Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), mirror=LEGS),
+    Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
+    Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
+    Term("probe_age", 1, lambda s: s.late[:, None].astype(np.float64)),
+    Term("closing_speed", 1, lambda s: s.closing[:, None]),
 )
-_COSINE: Term[Seen] = Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), mirror=LEGS)
-_PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
-_AGE: Term[Seen] = Term("probe_age", 1, lambda s: s.late[:, None].astype(np.float64))
-_CLOSING: Term[Seen] = Term("closing_speed", 1, lambda s: s.closing[:, None])
-_CUES: dict[str, Term[Seen]] = {
-    "semantic": Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
-    "geometric": Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
-}
 
 
 def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
     """The terms of the high policy's observation o^H, in order."""
-    clock = (_COSINE,) if config.clock == "both" else ()
-    cues = [term for cue, term in _CUES.items() if config.cues in ("both", cue)]
-    age = (_AGE,) if config.probe_age and config.cues in ("both", "geometric") else ()
-    closing = (_CLOSING,) if config.closing_speed else ()
-    return (*_LAYOUT, *clock, *cues, *age, *closing)
+    geometric = config.cues in ("both", "geometric")
+    optional = {
+        "clock_cosine": config.clock == "both",
+        "family": config.cues in ("both", "semantic"),
+        "probes": geometric,
+        "probe_age": geometric and config.probe_age,
+        "closing_speed": config.closing_speed,
+    }
+    return tuple(term for term in _TERMS if optional.get(term.name, True))
 
 
 def untold_column(config: HighLevelConfig) -> int | None:
