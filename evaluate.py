@@ -32,14 +32,7 @@ from tdgc.benchmark.results import FILES, STOPS, describe, salvage, what_stopped
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
-from tdgc.config import (
-    FIRST_TEACHER,
-    ConfigError,
-    HighLevelConfig,
-    LowLevelConfig,
-    TeacherConfig,
-    recorded,
-)
+from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
 from tdgc.errors import InputError, require
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
@@ -50,7 +43,7 @@ from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.world import WindowError
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.manners import find_manner
+from tdgc.tasks.manners import find_manner, manner_of
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.teacher import Skill
 
@@ -234,12 +227,12 @@ class Evaluation:
         try:
             if self.high is None:
                 raise ConfigError("there is no high policy")
-            taught = load_high(self.high, low, config)[0].meta.get("teacher", FIRST_TEACHER)
+            high, _ = load_high(self.high, low, config)
         except ConfigError as error:
             print(f"{error}: trying out how the low policy walks and leaps best")
             manner = find_manner(low, HighLevelConfig(), print)
         else:
-            manner = recorded(TeacherConfig, taught, f"{self.high}, meta.teacher")
+            manner = manner_of(high, self.high)
         return Skill(measure_landing(low, config, manner.leap_speed), manner)
 
     def drivers(self, low: Policy, config: LowLevelConfig) -> dict[str, Driver]:

@@ -20,14 +20,11 @@ from tqdm import tqdm
 
 from tdgc import __version__, policies
 from tdgc.config import (
-    FIRST_TEACHER,
     NO_TEACHER,
     PRESETS,
     ConfigError,
     HighLevelConfig,
     HighTrainConfig,
-    TeacherConfig,
-    recorded,
     to_dict,
     with_overrides,
 )
@@ -54,7 +51,7 @@ from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.manners import find_manner
+from tdgc.tasks.manners import find_manner, manner_of
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.teacher import Skill
 from tdgc.tasks.tiles import check_families, check_levels
@@ -106,8 +103,7 @@ def with_manner(config: HighTrainConfig, low: Policy, init: Path | None) -> High
     if imitation.teacher is not None:
         return config
     if init is not None:
-        taught = policies.load(init).meta.get("teacher", FIRST_TEACHER)
-        manner = recorded(TeacherConfig, taught, f"{init}, meta.teacher")
+        manner = manner_of(policies.load(init), init)
     elif imitation.steps:
         manner = find_manner(low, config.env, tqdm.write)
     else:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdgc.config import HighLevelConfig, TeacherConfig
+from tdgc.config import FIRST_TEACHER, HighLevelConfig, TeacherConfig, recorded
 from tdgc.sim.commands import NUM_ACTIONS
 from tdgc.sim.terrain import MAX_LEVEL, may_have_trenches
 from tdgc.tasks.high_env import NavigationTask
@@ -66,6 +66,17 @@ def find_manner(low: "Policy", env: HighLevelConfig, tell: Callable[[str], None]
         others = [dataclasses.replace(best, leap_speed=speed) for speed in LEAPS]
         best = choose(leap, [best, *others])
     return best
+
+
+def manner_of(high: "Policy", source: object) -> TeacherConfig:
+    """The manner of the teacher that the policy ``high`` of the file ``source`` imitated; the first
+    one if it records none.
+
+    Raises:
+        ConfigError: the record cannot be used; the message begins with ``source``.
+    """
+    taught = high.meta.get("teacher", FIRST_TEACHER)
+    return recorded(TeacherConfig, taught, f"{source}, meta.teacher")
 
 
 def choose(
