@@ -3,13 +3,11 @@
 import argparse
 import configparser
 import dataclasses
-import os
 import re
 import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,102 +68,93 @@ HIGH = (
 )
 ONE = "--episodes 1 --workers 1"
 FALL = f"--policies gp --families gap --levels 10 {ONE}"  # into the first trench, within seconds
-#: Commands that are run, in chains: each needs what those before it in its chain leave.
-CHAINS: tuple[dict[str, Run], ...] = (
-    {
-        "python train_low.py": Run(
-            LOW,
-            (
-                "runs/low/config.json",
-                "runs/low/policy.json",
-                "runs/low/checkpoints/step-000000000128",
-                "runs/low/tensorboard",
-                "runs/low/training.png",
-            ),
+#: Commands that are run, in order: some need what those before them leave.
+RUNS: dict[str, Run] = {
+    "python train_low.py": Run(
+        LOW,
+        (
+            "runs/low/config.json",
+            "runs/low/policy.json",
+            "runs/low/checkpoints/step-000000000128",
+            "runs/low/tensorboard",
+            "runs/low/training.png",
         ),
-        "python train_low.py --resume --time-limit 3600": Run(
-            "--steps 256", ("runs/low/policy.safetensors", "runs/low/checkpoints/step-000000000256")
-        ),
-        "tensorboard --logdir runs": Run("--inspect --logdir runs/low", ()),
-        "python train_high.py --low runs/low/policy": Run(
-            HIGH, ("runs/high/policy.safetensors", "runs/high/training.png")
-        ),
-        "python evaluate.py --low runs/low/policy --high runs/high/policy --levels 6-10": Run(
-            f"--levels 6 --families tilt {ONE} --out runs/pair",
-            tuple(
-                f"runs/pair/{name}"
-                for name in (
-                    "episodes.csv",
-                    "summary.json",
-                    "success.png",
-                    "gaits.png",
-                    "headings.png",
-                    "trajectories.png",
-                    "trajectories.npz",
-                )
-            ),
-        ),
-        "python evaluate.py --low runs/low/policy --tracking": Run(
-            f"{ONE} --out runs/tracking", ("runs/tracking/tracking.json",)
-        ),
-        "python -m tdgc.export --low runs/low/policy --high runs/high/policy --out runs/export": (
-            Run(
-                "--low tdgc/pretrained/low --high tdgc/pretrained/high --format torchscript",
-                ("runs/export/low.pt", "runs/export/high_interface.json"),
+    ),
+    "python train_low.py --resume --time-limit 3600": Run(
+        "--steps 256", ("runs/low/policy.safetensors", "runs/low/checkpoints/step-000000000256")
+    ),
+    "tensorboard --logdir runs": Run("--inspect --logdir runs/low", ()),
+    "python train_high.py --low runs/low/policy": Run(
+        HIGH, ("runs/high/policy.safetensors", "runs/high/training.png")
+    ),
+    "python evaluate.py --low runs/low/policy --high runs/high/policy --levels 6-10": Run(
+        f"--levels 6 --families tilt {ONE} --out runs/pair",
+        tuple(
+            f"runs/pair/{name}"
+            for name in (
+                "episodes.csv",
+                "summary.json",
+                "success.png",
+                "gaits.png",
+                "headings.png",
+                "trajectories.png",
+                "trajectories.npz",
             )
         ),
-        "python train_high.py --low runs/low/policy --init runs/high/policy "
-        """--set 'env.families=["rough","stair","hills.npy"]' --out runs/hills""": Run(
-            HIGH, ("runs/hills/policy.safetensors",)
-        ),
-    },
-    {
-        ".venv/bin/python evaluate.py --families stair,gap --levels 6 --episodes 1 "
-        "--policies tdgc --video": Run(FALL, ("runs/evaluation/report.html",)),
-        "python evaluate.py --video --families stair,gap --levels 8": Run(
-            FALL,
-            (
-                "runs/evaluation/films/film_gp_nominal_gap_10_000.mp4",
-                "runs/evaluation/films/sheet_gp_nominal_gap_10_000.png",
-                "runs/evaluation/films/strip_gap_10.png",
-            ),
-        ),
-        "python evaluate.py --trace failed": Run(
-            FALL,
-            (
-                "runs/evaluation/diagnosis.csv",
-                "runs/evaluation/traces/gp_nominal_gap_10_000.parquet",
-            ),
-        ),
-        "python evaluate.py --policies teacher --families stair,gap --episodes 20": Run(
-            f"--families gap --levels 6 {ONE}", ("runs/evaluation/summary.json",)
-        ),
-        "python evaluate.py --policies tdgc --set decoder.vx.high=0.6 --set safety.max_tilt=0.5": (
-            Run(f"--levels 0 --families rough {ONE}", ("runs/evaluation/tuning.json",))
-        ),
-        "python evaluate.py --families hills.npy": Run(
-            f"--levels 5 --policies gp {ONE}", ("runs/evaluation/trajectories.png",)
-        ),
-        "python evaluate.py --families ripples.npy,cobbles.npy,logs.npy,terraces.npy,dome.npy,"
-        "bridge.npy,walls.npy,crates.npy": Run(
-            f"--levels 5 --policies gp {ONE}", ("runs/evaluation/summary.json",)
-        ),
-    },
-    {
-        "python train_low.py --set env.robot.urdf=a1/a1.urdf --out runs/a1_low": Run(
-            LOW, ("runs/a1_low/policy.safetensors",)
-        ),
-        "python train_high.py --low runs/a1_low/policy --out runs/a1_high": Run(
-            HIGH, ("runs/a1_high/policy.safetensors",)
-        ),
-    },
-    {
-        "python -m tdgc.bench --out runs/bench": Run(
-            "--robots 2 --workers 1 --seconds 0.1", ("runs/bench/bench.json",)
+    ),
+    "python evaluate.py --low runs/low/policy --tracking": Run(
+        f"{ONE} --out runs/tracking", ("runs/tracking/tracking.json",)
+    ),
+    "python -m tdgc.export --low runs/low/policy --high runs/high/policy --out runs/export": (
+        Run(
+            "--low tdgc/pretrained/low --high tdgc/pretrained/high --format torchscript",
+            ("runs/export/low.pt", "runs/export/high_interface.json"),
         )
-    },
-)
-RUNS = {command: run for chain in CHAINS for command, run in chain.items()}
+    ),
+    "python train_high.py --low runs/low/policy --init runs/high/policy "
+    """--set 'env.families=["rough","stair","hills.npy"]' --out runs/hills""": Run(
+        HIGH, ("runs/hills/policy.safetensors",)
+    ),
+    ".venv/bin/python evaluate.py --families stair,gap --levels 6 --episodes 1 "
+    "--policies tdgc --video": Run(FALL, ("runs/evaluation/report.html",)),
+    "python evaluate.py --video --families stair,gap --levels 8": Run(
+        FALL,
+        (
+            "runs/evaluation/films/film_gp_nominal_gap_10_000.mp4",
+            "runs/evaluation/films/sheet_gp_nominal_gap_10_000.png",
+            "runs/evaluation/films/strip_gap_10.png",
+        ),
+    ),
+    "python evaluate.py --trace failed": Run(
+        FALL,
+        ("runs/evaluation/diagnosis.csv", "runs/evaluation/traces/gp_nominal_gap_10_000.parquet"),
+    ),
+    "python evaluate.py --policies teacher --families stair,gap --episodes 20": Run(
+        f"--families gap --levels 6 {ONE}", ("runs/evaluation/summary.json",)
+    ),
+    "python evaluate.py --policies tdgc --set decoder.vx.high=0.6 --set safety.max_tilt=0.5": (
+        Run(f"--levels 0 --families rough {ONE}", ("runs/evaluation/tuning.json",))
+    ),
+    "python evaluate.py --families hills.npy": Run(
+        f"--levels 5 --policies gp {ONE}", ("runs/evaluation/trajectories.png",)
+    ),
+    "python evaluate.py --families ripples.npy,cobbles.npy,logs.npy,terraces.npy,dome.npy,"
+    "bridge.npy,walls.npy,crates.npy": Run(
+        f"--levels 5 --policies gp {ONE}", ("runs/evaluation/summary.json",)
+    ),
+    "python train_low.py --set env.robot.urdf=a1/a1.urdf --out runs/a1_low": Run(
+        LOW, ("runs/a1_low/policy.safetensors",)
+    ),
+    "python train_high.py --low runs/a1_low/policy --out runs/a1_high": Run(
+        HIGH, ("runs/a1_high/policy.safetensors",)
+    ),
+    "python evaluate.py --low pairs/a1/low --high pairs/a1/high --levels 6-10": Run(
+        f"--families rough --levels 0 --policies tdgc {ONE}", ("runs/evaluation/summary.json",)
+    ),
+    "python -m tdgc.bench --out runs/bench": Run(
+        "--robots 2 --workers 1 --seconds 0.1", ("runs/bench/bench.json",)
+    ),
+}
 #: Commands that take long, or need a display or a cluster: only their flags are parsed.
 READ = (
     "python evaluate.py --tracking",
@@ -204,7 +193,6 @@ BY_CI = (
     ".venv/bin/python -m mypy tdgc",
 )
 PROGRAMS = {
-    "python": [sys.executable],
     ".venv/bin/python": [sys.executable],
     "tensorboard": [sys.executable, "-m", "tensorboard.main"],
 }
@@ -253,37 +241,30 @@ def test_every_command_is_run_or_read() -> None:
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in which commands run as in the repository and write their files."""
     folder = tmp_path_factory.mktemp("workspace")
-    for name in ("train_low.py", "train_high.py", "evaluate.py", "tdgc", "urdf"):
+    for name in ("train_low.py", "train_high.py", "evaluate.py", "tdgc", "urdf", "pairs"):
         (folder / name).symlink_to(ROOT / name)
     return folder
 
 
-def test_commands_run(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_run(
+    workspace: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(workspace)
     for name, text in TEXT.items():
         for code in blocks(text, "python"):
             exec(compile(code, name, "exec"), {})  # some write a robot or a terrain
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-
-    def run(chain: dict[str, Run]) -> None:
-        for command, short in chain.items():
-            program, *arguments = shlex.split(f"{command} {short.added}")
-            result = subprocess.run(
-                [*PROGRAMS[program], *arguments],
-                cwd=workspace,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                timeout=600,
-            )
-            output = (result.stdout + result.stderr)[-4000:]
-            assert result.returncode == 0, f"{command}\n{output}"
-            left = [name for name in short.leaves if not (workspace / name).exists()]
-            assert not left, f"{command} left no {', '.join(left)}"
-
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        list(pool.map(run, CHAINS))
+    for command, short in RUNS.items():
+        program, *arguments = shlex.split(f"{command} {short.added}")
+        if program == "python":  # not in a process of its own, which takes seconds to start
+            script, *flags = [word for word in arguments if word != "-m"]
+            status = MAINS[script](flags)
+        else:
+            words = [*PROGRAMS[program], *arguments]
+            status = subprocess.run(words, stdin=subprocess.DEVNULL, timeout=600).returncode
+        output = "".join(capfd.readouterr())[-4000:]
+        assert status == 0, f"{command}\n{output}"
+        left = [name for name in short.leaves if not (workspace / name).exists()]
+        assert not left, f"{command} left no {', '.join(left)}"
 
 
 @pytest.mark.parametrize("command", READ)
@@ -434,7 +415,7 @@ def test_rooms_are_in_order() -> None:
     rooms = [name for name in named if name in FLOOR]
     assert {*rooms, "tdgc"} == FLOOR.keys()
     assert [FLOOR[name] for name in rooms] == sorted(FLOOR[name] for name in rooms)
-    assert set(named) - set(rooms) == {"pretrained", "urdf"}
+    assert set(named) - set(rooms) == {"pretrained", "pairs", "urdf"}
     assert not [door for door in DOORS if f"`tdgc.{door}`" not in TEXT["CONTRIBUTING.md"]]
 
 
@@ -447,7 +428,7 @@ def anchors(text: str) -> set[str]:
 @pytest.mark.parametrize("name", TEXT)
 def test_what_is_named_is_there(name: str) -> None:
     text, folder = TEXT[name], ROOT if (ROOT / name).is_file() else ROOT / "docs"
-    paths = re.findall(r"(?:tdgc|docs|tests|urdf|\.ci)/[\w/.-]*\w", text)
+    paths = re.findall(r"(?:tdgc|docs|tests|urdf|pairs|\.ci)/[\w/.-]*\w", text)
     made = ("tdgc/LowLevel-v0", "tdgc/Navigation-v0", "docs/robot.gif")
     places = [link.split("#") for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text)]
     links = [place[0] for place in places]
