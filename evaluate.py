@@ -12,7 +12,6 @@ python evaluate.py --set decoder.vx.high=0.6 --set safety.max_tilt=0.5
 
 import argparse
 import functools
-import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -34,6 +33,7 @@ from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
 from tdgc.errors import InputError, require
+from tdgc.files import write_json
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
 from tdgc.parallel.cores import usable_cores
@@ -374,7 +374,7 @@ def run_table(
     if e.tuning is not None:
         effect = tuning.compare(episodes, "tdgc", TUNED)
         result = {"tuning": tuning.record(e.tuning), "effect": effect}
-        (out / "tuning.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
+        write_json(out / "tuning.json", result)
         print_effect(effect)
     print(f"\ntables and figures are in {out}")
     painters = e.workers if e.cluster is None else usable_cores()
@@ -416,7 +416,7 @@ def run_tracking(evaluation: Evaluation, low: Policy) -> None:
     """Measure the low policy alone, print the results and write tracking.json."""
     e = evaluation
     result = tracking(low, e.episodes, e.seed, e.workers, e.run_jobs)
-    (e.out / "tracking.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
+    write_json(e.out / "tracking.json", result)
     print("gait    velocity RMSE  yaw rate RMSE  contact match")
     for gait, r in result["gaits"].items():
         print(

@@ -16,7 +16,6 @@ robots on the plane; the table goes to ``cluster.json``.
 
 import argparse
 import functools
-import json
 import math
 import os
 import sys
@@ -35,7 +34,7 @@ from stable_baselines3.common.logger import Logger
 
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
 from tdgc.errors import InputError
-from tdgc.files import make_folder
+from tdgc.files import make_folder, write_json
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
@@ -379,7 +378,7 @@ def main(arguments: list[str] | None = None) -> int:
             name, result = "cluster.json", compare_places(args.robots, args.workers, args.seconds)
         else:
             name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
-        (args.out / name).write_text(json.dumps(result, indent=2), encoding="utf-8")
+        write_json(args.out / name, result)
     except (WorkerError, OSError) as error:
         lines = str(error).splitlines()  # a worker's traceback is between the first and last
         said = " ".join(dict.fromkeys((lines[0], lines[-1])))

@@ -32,7 +32,7 @@ from tdgc.deploy.controller import FORMATS, Controller, quiet
 from tdgc.deploy.graphs import HighGraph, LowGraph, Signal
 from tdgc.deploy.interface import VERSION, Table, interface_path
 from tdgc.errors import require
-from tdgc.files import checksum
+from tdgc.files import checksum, write_text
 from tdgc.policies import Policy
 from tdgc.sim.commands import CONTINUOUS, NAMES, UNITS, CommandDecoder, default_command
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
@@ -227,7 +227,7 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
                 _write_graph(graph, path)
                 files[form] = _file(path)
         text = json.dumps(tables[name] | {"files": files}, indent=2) + "\n"
-        interface_path(folder, name).write_text(text, encoding="utf-8")
+        write_text(interface_path(folder, name), text)
 
 
 def _file(path: Path) -> Table:

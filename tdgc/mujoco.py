@@ -9,7 +9,6 @@ docs/mujoco.md lists its settings. It needs the extra ``mujoco``.
 
 import argparse
 import functools
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,6 +27,7 @@ from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
 from tdgc.errors import require
+from tdgc.files import write_json
 from tdgc.parallel.jobs import run_jobs
 from tdgc.show import film
 from tdgc.sim.commands import INDEX
@@ -180,7 +180,7 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
         Exception: one of ``STOPS`` occurred; the table of the complete cells is still written.
     """
     settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
-    (args.out / "settings.json").write_text(json.dumps(settings, indent=2), encoding="utf-8")
+    write_json(args.out / "settings.json", settings)
     cells = plan([POLICY], ["nominal"], args.families, args.levels, args.episodes)
     work = functools.partial(
         run_cell,

@@ -15,7 +15,6 @@ Run it in the root of the repository, where the scripts are.
 
 import argparse
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,7 @@ from tdgc.ablate.trials import Runner, StoppedError, Tile, Trial, TrialError, un
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
-from tdgc.files import atomic
+from tdgc.files import write_json, write_text
 from tdgc.parallel.cores import workers_flag
 from tdgc.show import plots
 from tdgc.sim.terrain import EDITION, family_number, is_map
@@ -136,8 +135,7 @@ def claim(runner: Runner, tiles: Sequence[Tile]) -> dict[str, Any]:
     path = runner.out / "settings.json"
     if not path.is_file():
         runner.out.mkdir(parents=True, exist_ok=True)
-        with atomic(path) as partial:
-            partial.write_text(json.dumps(common, indent=2), encoding="utf-8")
+        write_json(path, common)
         return common
     before = read_json(path)
     if not isinstance(before, dict):
@@ -161,13 +159,8 @@ def report(
     """Write ablation.json, ablation.txt and ablation.png of the results so far; return the text."""
     table = rows(tiles, trials, found)
     described = describe(table)
-    written = {
-        "ablation.json": json.dumps({"settings": common, "rows": table}, indent=2),
-        "ablation.txt": f"{described}\n",
-    }
-    for name, text in written.items():
-        with atomic(out / name) as partial:
-            partial.write_text(text, encoding="utf-8")
+    write_json(out / "ablation.json", {"settings": common, "rows": table})
+    write_text(out / "ablation.txt", f"{described}\n")
     plots.ablation(out / "ablation.json", out / "ablation.png")
     return described
 

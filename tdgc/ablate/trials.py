@@ -8,7 +8,6 @@ import contextlib
 import csv
 import io
 import itertools
-import json
 import shutil
 import signal
 import sys
@@ -27,7 +26,7 @@ from tdgc import policies
 from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError
-from tdgc.files import atomic
+from tdgc.files import write_json
 from tdgc.parallel.cores import Workers
 from tdgc.sim.terrain import UNNAMED
 from tdgc.tasks.pairing import load_low
@@ -148,8 +147,7 @@ class Runner:
         found = {"evaluate_seconds": round(time.monotonic() - began, 1)}
         if trial.variant.settings is not None:
             found |= _training_facts(folder / "policy", low)
-        with atomic(folder / "cell.json") as partial:
-            partial.write_text(json.dumps(found, indent=2), encoding="utf-8")
+        write_json(folder / "cell.json", found)
 
     def tiles(self) -> list[Tile]:
         """The tiles that each trial is evaluated on.

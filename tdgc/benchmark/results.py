@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
 from tdgc.errors import InputError
-from tdgc.files import atomic
+from tdgc.files import atomic, write_json
 from tdgc.parallel.worker import WorkerError
 from tdgc.sim.terrain import EDITION
 
@@ -208,8 +207,7 @@ def write_results(
         summary[SIDES] = found
     if editions:
         summary[EDITIONS] = {"tiles": EDITION, **editions}
-    with atomic(folder / "summary.json") as partial:
-        partial.write_text(json.dumps(summary, indent=2), encoding="utf-8")
+    write_json(folder / "summary.json", summary)
     return summary
 
 

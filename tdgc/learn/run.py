@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from tdgc import policies
 from tdgc.config import HighTrainConfig, LowTrainConfig, to_dict
-from tdgc.files import atomic
+from tdgc.files import write_json, write_text
 from tdgc.learn.checkpoints import Checkpoint
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import MakeLink, WorkerError, memory_mb
@@ -158,7 +158,8 @@ class Run:
                 if self.init is not None:
                     policies.load_into(self.init, model.policy)
                 env.reset()
-            self._write_config()  # only now, so that a run that cannot start leaves none behind
+            # Only now, so that a run that cannot start leaves none behind.
+            write_json(self.folder / "config.json", to_dict(self.config))
             if last is not None:
                 drop_rows_after(last.steps, self.folder / "log.jsonl")
             # The latest observations, which SB3 otherwise keeps from the previous rollout.
@@ -177,10 +178,6 @@ class Run:
             return taken, finished, callback.unsaved
         finally:
             env.close()
-
-    def _write_config(self) -> None:
-        with atomic(self.folder / "config.json") as path:
-            path.write_text(json.dumps(to_dict(self.config), indent=2), encoding="utf-8")
 
 
 class RunCallback(BaseCallback):
@@ -361,8 +358,7 @@ def drop_rows_after(steps: int, path: Path) -> None:
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     kept = [line for line in lines if json.loads(line)["steps"] <= steps]
     if len(kept) < len(lines):
-        with atomic(path) as file:
-            file.write_text("".join(kept), encoding="utf-8")
+        write_text(path, "".join(kept))
 
 
 def learn(model: Any, callback: RunCallback, until: int) -> bool:

@@ -21,7 +21,7 @@ import tdgc
 from tdgc.benchmark.diagnosis import LAYERS, count_failures
 from tdgc.benchmark.evaluation import CONDITIONS, EpisodeRecord
 from tdgc.benchmark.results import EDITIONS, PAIRED, SIDES, policies_of, verdict
-from tdgc.files import atomic
+from tdgc.files import write_text
 from tdgc.sim.terrain import file_label, is_map
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
@@ -274,6 +274,5 @@ def write(folder: Path) -> Path:
     """
     path = folder / NAME
     text = render(folder)
-    with atomic(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_text(path, text)
     return path
