@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 import ray
 from ray.cluster_utils import Cluster
-from test_faults import HANG, RAISE, SPACES, Fragile, actions, drawn, step
+from stubs import HANG, RAISE, Fragile
+from test_faults import SPACES, actions, drawn, step
 from test_training import TINY, at_calls, final
 
 import evaluate

@@ -41,7 +41,7 @@ from tdgc.sim.robot import Array
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, Seen, high_layout
-from tdgc.tasks.leaps import SPEED, Landing, measure_landing
+from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 from tdgc.tasks.teacher import Skill
@@ -159,7 +159,7 @@ def test_baseline_keeps_to_the_ranges_that_it_is_given(low):
 def test_the_teacher_drives_as_it_teaches(low, family):
     """Its commands are those that the student is shown, held for a decision."""
     config = dataclasses.replace(CONFIG, families=(family,))
-    skill = Skill(measure_landing(*low, SPEED))
+    skill = Skill(Landing(-0.02, 0.08))
     task = NavigationTask(config, LOW, 2, seed=4, training=False, taught=skill)
     try:
         task.reset(np.arange(2))

@@ -332,6 +332,7 @@ def test_the_table_does_not_depend_on_the_processes(table, low, high, tmp_path):
     assert [{k: str(v) for k, v in e.row().items()} for e in here] == rows_of(table)[:2]
 
 
+@pytest.mark.usefixtures("in_process")
 def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "SHIPPED_HIGH", tmp_path / "none")
     flags = ["--levels", "10", "--families", "gap", "--episodes", "1", "--workers", "1"]
@@ -403,6 +404,7 @@ def test_an_evaluation_checks_itself():
             dataclasses.replace(whole, **change)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_the_teacher_leads_on_any_terrain(tmp_path):
     """On a user's map it leaps over a trench and finds the gate in a wall; it also leads on two
     families in one tile, and where the family is not told."""
@@ -579,6 +581,7 @@ def test_a_training_may_rewrite_the_policy_meanwhile(low, tmp_path, monkeypatch)
     assert summary["editions"]["high"] == 2 and summary["tdgc"]["nominal"]["mean"]["n"] == 4
 
 
+@pytest.mark.usefixtures("in_process")
 def test_cues_are_a_policy_of_the_script(tmp_path, capsys):
     flags = ["--levels", "4", "--families", "pillar", "--episodes", "1", "--workers", "1"]
     assert evaluate.main([*flags, "--policies", "cues", "--out", str(tmp_path)]) == 0

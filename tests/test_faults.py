@@ -5,101 +5,22 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stubs import DIE, FAR, HANG, INFINITE, NAN_EARNED, NAN_SEEN, RAISE, Fragile
 
 from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.parallel.vec import FAULT_STEPS, Fault, TaskVecEnv, worker_seed
 from tdgc.parallel.worker import WorkerError
 from tdgc.sim.observation import columns
-from tdgc.sim.robot import Array
-from tdgc.state import State, join, split
+from tdgc.state import join, split
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import CRITIC_LAYOUT
-
-# Actions by which a robot makes its task fail.
-RAISE, DIE, HANG, NAN_SEEN, NAN_EARNED, INFINITE, FAR = range(2, 9)
-
-
-class Fragile:
-    """A task whose robots observe their number, the level, their steps and a random number.
-
-    It has no memory beyond its state, so ``forget`` only counts its calls. The level rises
-    with each step of the task and stands for what a task learns, such as a curriculum. The random
-    number is drawn at each restart. A robot's reward is its action.
-    """
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
-    action_space = gym.spaces.Box(-9.0, 9.0, (1,), np.float32)
-
-    def __init__(self, robots: int, seed: int, first: int = 0) -> None:
-        self.num_robots = robots
-        self.rng = np.random.default_rng(seed)
-        self.level, self.restarts, self.forgot = 0, 0, 0
-        self.restart()
-
-    def reset(self, index: Any) -> None:
-        self.steps[index] = 0
-        self.action[index] = 0.0
-
-    def step(self, actions: Any) -> tuple[Array, Any, Any]:
-        self.action = actions[:, 0].astype(np.float64)
-        if (self.action == RAISE).any():
-            raise ValueError("the ground is gone")
-        if (self.action == DIE).any():
-            os.kill(os.getpid(), signal.SIGKILL)
-        if (self.action == HANG).any():
-            time.sleep(1e6)
-        self.steps += 1
-        self.level += 1
-        reward = self.action.copy()
-        reward[self.action == NAN_EARNED] = np.nan
-        terminated = (self.action == NAN_SEEN) | (self.action == FAR)
-        return reward, terminated, np.zeros(self.num_robots, dtype=bool)
-
-    def observe(self) -> Any:
-        ones = np.ones(self.num_robots)
-        parts = [np.arange(self.num_robots), self.level * ones, self.steps, self.drawn * ones]
-        obs = np.stack(parts, axis=1).astype(np.float32)
-        for action, value in ((NAN_SEEN, np.nan), (INFINITE, -np.inf), (FAR, 1e6)):
-            obs[self.action == action, 2] = value
-        return obs
-
-    def restart(self) -> None:
-        self.restarts += 1
-        self.drawn = self.rng.uniform()
-        self.steps = np.zeros(self.num_robots)
-        self.action = np.zeros(self.num_robots)
-
-    def take_stats(self) -> dict[str, float]:
-        return {"restarts": float(self.restarts), "forgot": float(self.forgot)}
-
-    def forget(self) -> None:
-        self.forgot += 1
-
-    def state_dict(self) -> State:
-        episodes = {"steps": self.steps.copy(), "drawn": self.drawn}
-        return {"rng": self.rng.bit_generator.state, "level": self.level, "episodes": episodes}
-
-    def load_state_dict(self, state: State) -> None:
-        self.rng.bit_generator.state = state["rng"]
-        self.level = state["level"]
-        if "episodes" not in state:
-            self.restart()
-            return
-        self.steps = state["episodes"]["steps"].copy()
-        self.drawn = state["episodes"]["drawn"]
-
-    def close(self) -> None:
-        pass
-
 
 SPACES = (Fragile.observation_space, Fragile.action_space)
 

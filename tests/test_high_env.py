@@ -76,56 +76,6 @@ def step_of(**changes) -> HighStep:
     return dataclasses.replace(base, **changes)
 
 
-def test_goal_distance_is_the_papers_curve():
-    # R_map = 8, a = 1, b = 3: halfway, p = 0.5.
-    assert rewards.goal_distance(step_of())[0] == pytest.approx(0.5 + 1.0 - np.exp(-1.5))
-    assert rewards.goal_distance(step_of(distance=np.array([9.0])))[0] == 0.0
-    assert rewards.goal_distance(step_of(distance=np.array([0.0])))[0] == pytest.approx(
-        2.0 - np.exp(-3.0)
-    )
-
-
-def test_face_is_the_cosine():
-    assert rewards.face(step_of(heading_error=np.array([np.pi / 3])))[0] == pytest.approx(0.5)
-
-
-def test_arrival_pays_inside_the_radius_and_more_when_early():
-    assert rewards.arrive(step_of(distance=np.array([0.5])))[0] == 0.0
-    inside = step_of(distance=np.array([0.49]))
-    assert rewards.arrive(inside)[0] == pytest.approx(1.0 + 2.0 * 0.75)
-
-
-def test_stable_standing():
-    inside = step_of(distance=np.array([0.1]))
-    assert rewards.stable(inside)[0] == 1.0
-    moving = dataclasses.replace(
-        inside, lin_vel=np.array([[0.3, 0.4, 0.0]]), base_height=np.array([0.40])
-    )
-    assert rewards.stable(moving)[0] == pytest.approx(np.exp(-0.5) * np.exp(-1.0))
-    assert rewards.stable(step_of())[0] == 0.0
-
-
-def test_smoothness_terms():
-    actions = np.zeros((2, 1, 13))
-    actions[0, 0, :2] = [0.5, -0.5]
-    assert rewards.high_action_rate(step_of(actions=actions))[0] == pytest.approx(0.5)
-    commands = np.zeros((3, 1, 15))
-    commands[0], commands[1] = 0.3, 0.1
-    assert rewards.command_rate(step_of(commands=commands))[0] == pytest.approx(0.04)
-    assert rewards.command_acceleration(step_of(commands=commands))[0] == pytest.approx(0.01)
-
-
-def test_contact_force_beyond_the_threshold():
-    force = np.array([[41.0, 0.5, 3.0, 0.0, 0.0]])
-    assert rewards.contact_force(step_of(contact_forces=force))[0] == pytest.approx(42.0)
-
-
-def test_laziness_far_from_the_goal_only():
-    assert rewards.laziness(step_of())[0] == 1.0
-    assert rewards.laziness(step_of(lin_vel=np.array([[0.2, 0.0, 0.0]])))[0] == 0.0
-    assert rewards.laziness(step_of(distance=np.array([0.3])))[0] == 0.0
-
-
 def test_weights_are_scaled_by_the_steps_duration():
     terms = rewards.high_terms(step_of(), dt=0.1)
     assert terms["alive"][0] == pytest.approx(0.1 * HighRewardConfig().alive)

@@ -591,33 +591,42 @@ def test_penalties_count_least_on_relief() -> None:
 
 
 def test_leaps_grow_as_fast_as_pronk_does() -> None:
-    task = begin(dataclasses.replace(TILES, families=("gap",)), 400, training=True)
+    task = begin(dataclasses.replace(TILES, families=("gap",)), 40, training=True)
     assert task.commands.share[PRONK] == 0.4  # at the start of training
-    speed = task.episodes.speed[task.episodes.leaping]
-    assert 0.4 <= speed.min() and speed.max() <= 0.48
+    speeds = []
+    for _ in range(10):
+        task.reset(np.arange(40))
+        speeds.append(task.episodes.speed[task.episodes.leaping])
+    speed = np.concatenate(speeds)
+    assert speed.size > 200 and 0.4 <= speed.min() and speed.max() <= 0.48
     task.close()
 
 
 def test_most_crossings_of_trenches_leap() -> None:
-    task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 400)
-    pronks = (gait_index(task.locomotion.command) == 1) & task.episodes.crossing
-    gap = task.column == 0
-    leaps = task.episodes.leaping
-    assert (leaps == (pronks & gap)).all()
-    assert 0.75 < leaps[gap & task.episodes.crossing].mean() < 0.95
-    assert (task.episodes.facing[leaps] == 0.0).all()
-    command = task.locomotion.command[leaps]
+    task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 40)
+    gap, leaping, commands, yaw = task.column == 0, [], [], []
+    for _ in range(10):
+        task.reset(np.arange(40))
+        episodes, command = task.episodes, task.locomotion.command
+        leaps = episodes.leaping
+        assert (leaps == ((gait_index(command) == 1) & episodes.crossing & gap)).all()
+        assert (episodes.facing[leaps] == 0.0).all()
+        leaping.append(leaps[gap & episodes.crossing])
+        commands.append(command[leaps])
+        yaw.append(task.locomotion.world.state.yaw[leaps])
+    task.close()
+    assert 0.75 < np.concatenate(leaping).mean() < 0.95
+    command = np.concatenate(commands)
     # From rest, timed about as for strides of 0.39 m at 1.2 m/s, and never near the lowest 2 Hz.
     frequency = command[:, INDEX["frequency"]]
     assert frequency.min() > 2.4 and np.median(frequency) == pytest.approx(1.2 / 0.39, abs=0.2)
     assert (command[:, INDEX["duration"]] == DURATION).all()
     assert (command[:, INDEX["swing_height"]] <= 0.07).all()
-    speed = np.hypot(*command[:, :2].T)
     # They move sideways as needed to reach the goal, but face across the trenches.
-    turn, yaw = command[:, INDEX["yaw_rate"]], task.locomotion.world.state.yaw[leaps]
-    np.testing.assert_allclose(turn, -yaw, atol=1e-9)
+    turn = command[:, INDEX["yaw_rate"]]
+    np.testing.assert_allclose(turn, -np.concatenate(yaw), atol=1e-9)
+    speed = np.hypot(*command[:, :2].T)
     assert speed.min() > 0.5 and speed.max() <= 1.2 + 1e-9
-    task.close()
 
 
 def test_a_crossing_of_a_hard_tile_asks_for_high_feet_and_a_straight_trunk() -> None:
@@ -737,7 +746,12 @@ def test_half_an_episode_is_no_reason_for_demotion() -> None:
 
 def test_beyond_the_last_level_any_level_follows() -> None:
     assert ended(2.0, reached=True, level=9) == 10
-    assert 0 <= ended(2.0, reached=True, level=10) <= 10
+    task = begin(dataclasses.replace(TILES, families=("stair",)), 4)
+    task.episodes.crossing[:] = task.episodes.reached[:] = True
+    everyone, x = np.ones(4, dtype=bool), np.full(4, 7.0)
+    moved = [task.crossings.move(np.full(4, 10), x, everyone, everyone) for _ in range(100)]
+    assert np.unique(moved).tolist() == list(range(11))
+    task.close()
 
 
 def test_leaving_a_tile_early_neither_promotes_nor_demotes() -> None:

@@ -398,12 +398,8 @@ def high_step(**changes: object) -> HighStep:
         actions=np.zeros((2, 2, 13)),
         commands=np.zeros((3, 2, 15)),
         contact_forces=np.zeros((2, 5)),
-        config=HighRewardConfig(
-            map_radius=8.0, curve_gain=1.0, curve_rate=3.0, goal_radius=0.5, arrive_base=1.0,
-            arrive_speed=2.0, joint_speed_weight=0.05, height_scale=0.01, force_threshold=1.0,
-            lazy_speed=0.1,
-        ),
-    )  # fmt: skip
+        config=HighRewardConfig(),
+    )
     return dataclasses.replace(step, **changes)  # type: ignore[arg-type]
 
 

@@ -401,6 +401,7 @@ def test_selection(watched):
             Selection.parse(text)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
     flags = [*SMALL, "--policies", "gp", "--workers", "1", "--out", str(tmp_path)]
     assert evaluate.main([*flags, "--trace", "failed"]) == 0

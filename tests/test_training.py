@@ -557,6 +557,9 @@ def test_calibration_ends_a_run_of_the_low_policy(
     monkeypatch.setattr(calibration, "_EPOCHS", 2)
     monkeypatch.setattr(calibration, "_CORRECTIONS", 4)
     monkeypatch.setattr(calibration, "_ROBOTS", 12)
+    monkeypatch.setattr(calibration, "_WALK_SECONDS", 1.5)
+    monkeypatch.setattr(calibration, "_SETTLE_SECONDS", 0.7)
+    monkeypatch.setattr(calibration, "run_jobs", lambda work, jobs, workers: map(work, jobs))
     arguments = [*TINY, "--steps", "32", "--set", "calibration.robots=64"]
     arguments += ["--set", "calibration.turns=1"]
     whole, broken = tmp_path / "whole", tmp_path / "broken"

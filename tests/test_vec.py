@@ -13,87 +13,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from stubs import Counter, make_counter, make_failing
 
 from tdgc.config import LowLevelConfig, PhysicsConfig
 from tdgc.parallel.vec import TaskVecEnv, worker_seed
 from tdgc.parallel.worker import WorkerError
-from tdgc.sim.robot import Array
-from tdgc.state import State, split
+from tdgc.state import split
 from tdgc.tasks.low_env import LowLevelTask
 
 CONFIG = LowLevelConfig(episode_seconds=0.5, physics=PhysicsConfig(substeps=4))
 
 
-def make_robots(robots: int, seed: int, first: int = 0) -> LowLevelTask:
-    return LowLevelTask(CONFIG, robots, seed, first=first)
-
-
-class Counter:
-    """A task in which robot i ends every i + 2 steps: terminated if i is even, else truncated.
-
-    A robot observes its number, the steps of its episode, and its last reward, which is the sum of
-    its actions.
-    """
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
-    action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-
-    def __init__(self, robots: int, seed: int, fails: str = "", first: int = 0) -> None:
-        if fails == "start":
-            raise RuntimeError("no robot to be had")
-        self.num_robots, self.seed, self.fails = robots, seed, fails
-        self.steps = np.zeros(robots)
-        self.sums = np.zeros(robots)
-        self.worlds = 0
-        self.rng = np.random.default_rng(seed)
-
-    def reset(self, index: Any) -> None:
-        self.steps[index] = self.sums[index] = 0.0
-
-    def step(self, actions: Any) -> tuple[Array, Any, Any]:
-        if self.fails == "step" and actions[0, 0] == 1.0:
-            raise ValueError("the ground is gone")
-        self.steps += 1
-        self.sums = actions.sum(axis=1, dtype=np.float64)
-        number = np.arange(self.num_robots)
-        done = self.steps >= number + 2
-        return self.sums.copy(), done & (number % 2 == 0), done & (number % 2 == 1)
-
-    def observe(self) -> Any:
-        number = np.arange(self.num_robots)
-        return np.stack([number, self.steps, self.sums], axis=1).astype(np.float32)
-
-    def restart(self) -> None:
-        self.worlds += 1
-        self.reset(np.arange(self.num_robots))
-
-    def take_stats(self) -> dict[str, float]:
-        return {"robots": float(self.num_robots), "worlds": float(self.worlds)}
-
-    def forget(self) -> None:
-        pass
-
-    def state_dict(self) -> State:
-        rng, episodes = self.rng.bit_generator.state, {"steps": self.steps.copy()}
-        return {"seed": self.seed, "worlds": self.worlds, "rng": rng, "episodes": episodes}
-
-    def load_state_dict(self, state: State) -> None:
-        self.worlds = state["worlds"]
-        if "episodes" in state:
-            self.steps = state["episodes"]["steps"].copy()
-        else:
-            self.restart()
-
-    def close(self) -> None:
-        pass
-
-
-def make_counter(robots: int, seed: int, first: int = 0) -> Counter:
-    return Counter(robots, seed)
-
-
-def make_failing(where: str, robots: int, seed: int, first: int = 0) -> Counter:
-    return Counter(robots, seed, fails=where)
+make_robots = functools.partial(LowLevelTask, CONFIG)
 
 
 SPACES = (Counter.observation_space, Counter.action_space)

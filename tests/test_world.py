@@ -207,7 +207,7 @@ def resident() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def test_a_thousand_redraws_leak_nothing() -> None:
+def test_redraws_leak_nothing() -> None:
     field = TileField((1, 1), crop=2.5)
     world = World(1, ROBOT, PHYSICS, field)
     drawn = [make_tile(family, 1.0, np.random.default_rng(0)) for family in ALL_FAMILIES]
@@ -215,10 +215,10 @@ def test_a_thousand_redraws_leak_nothing() -> None:
         field.place(0, 0, drawn[k % len(drawn)])
         world.upload_terrain()
     before = resident()
-    for k in range(1000):
+    for k in range(300):  # 20 kB each would show
         field.place(0, 0, drawn[k % len(drawn)])
         world.upload_terrain()
-    assert resident() - before < 20.0
+    assert resident() - before < 6.0
     assert_rays_hit_the_field(world, 4)
     world.close()
 
