@@ -59,11 +59,12 @@ def test_the_high_policy_was_trained_with_the_defaults() -> None:
     path = PRETRAINED / "high_run" / "config.json"
     # A setting that came later has the value that the run had without it.
     run = recorded(HighTrainConfig, read(path), path)
-    # It is older than the trials. They find the same for the shipped low policy.
+    # What the trials found for the shipped low policy.
     assert run.imitation.teacher == TeacherConfig()
     imitation = dataclasses.replace(run.imitation, teacher=None)
     assert dataclasses.replace(run, imitation=imitation) == config
     meta = policies.load(PRETRAINED / "high").meta
+    assert meta["teacher"] == plain(TeacherConfig())
     assert recorded(HighLevelConfig, meta["config"], "high") == config.env
     assert meta["low"]["config"] == plain(low)
 
