@@ -15,11 +15,17 @@ def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to ``path`` to write to.
 
     On success the file written there replaces ``path``; on an exception ``path`` stays as it was.
+
+    Raises:
+        OSError: ``path`` cannot be replaced; the error names it alone.
     """
     partial = path.parent / f".{path.name}.{os.getpid()}.tmp"
     try:
         yield partial
-        os.replace(partial, path)
+        try:
+            os.replace(partial, path)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
         partial.unlink(missing_ok=True)
 

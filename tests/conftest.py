@@ -9,7 +9,10 @@ import pytest
 # PyTorch's threads wait busily, and the tests run in as many processes as there are cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import evaluate  # after the above, since it imports PyTorch
+# After the above, since they import numpy and PyTorch.
+from stubs import in_this_process
+
+import evaluate
 
 #: The slowest files, slowest first. Run in this order, no process is left without work at the end.
 SLOWEST = (
@@ -30,8 +33,8 @@ def signals() -> Iterator[None]:
 
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let evaluate.py run its jobs in this process: a new one takes seconds to import PyTorch."""
-    monkeypatch.setattr(evaluate, "run_jobs", lambda work, jobs, workers: map(work, jobs))
+    """Let evaluate.py run its jobs in this process."""
+    monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,8 +1,9 @@
-"""Tasks for tests of worker processes, which import this file: so it imports little."""
+"""Stand-ins. Worker processes of tests import this file, so it imports little."""
 
 import os
 import signal
 import time
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -154,3 +155,8 @@ def make_counter(robots: int, seed: int, first: int = 0) -> Counter:
 
 def make_failing(where: str, robots: int, seed: int, first: int = 0) -> Counter:
     return Counter(robots, seed, fails=where)
+
+
+def in_this_process(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:
+    """As ``run_jobs``, without processes, which take seconds to import PyTorch."""
+    return map(work, jobs)

@@ -2,12 +2,11 @@
 
 import itertools
 import json
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from stubs import in_this_process
 
 import evaluate
 import train_high
@@ -136,10 +135,6 @@ TINY = [
     "--set", "ppo.n_epochs=1", "--set", "imitation.steps=0", "--set", "checkpoint_seconds=1e6",
     "--set", 'env.families=["tilt"]',
 ]  # fmt: skip
-
-
-def in_this_process(work: Callable[[Any], Any], jobs: Sequence[Any], _: int) -> Iterator[Any]:
-    return map(work, jobs)
 
 
 def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(

@@ -55,8 +55,9 @@ def blamed(driver: HierarchyDriver, low: Any, cells: list[tuple[str, int, int]])
     ]
 
 
-def test_a_broken_motor_is_the_executions_fault(low, pair):
-    layers = blamed(WeakMotor(*pair, "RR_calf_joint"), low[0], [("rough", 4, 4), ("pillar", 4, 2)])
+@pytest.mark.parametrize("joint", ["FL_calf_joint", "RR_calf_joint"])
+def test_a_broken_motor_is_the_executions_fault(joint, low, pair):
+    layers = blamed(WeakMotor(*pair, joint), low[0], [("rough", 4, 4), ("pillar", 4, 2)])
     assert len(layers) >= 3 and layers.count("execution") >= 0.8 * len(layers)
 
 
@@ -93,7 +94,7 @@ def test_the_table_of_planted_faults(monkeypatch, capsys):
         "FAMILIES": ("rough",),
         "EPISODES": 4,
         "LIMIT_SEEDS": (1,),
-        "LIMIT_LEVELS": (0,),
+        "LIMIT_LEVELS": (2,),
         "LIMIT_EPISODES": 1,
     }
     for name, value in small.items():
@@ -105,7 +106,7 @@ def test_the_table_of_planted_faults(monkeypatch, capsys):
     assert total == "4 of 4 failures blamed on the layer at fault"
     assert walked == "without a fault, 95 % of 2 episodes that reached their goals"
     name, stretch, _, limit, episode, *_ = velocity.split()
-    assert name == "velocity" and 0.0 < float(episode) <= float(stretch) < 2.0 * float(limit)
+    assert name == "velocity" and 0.0 < float(episode) < float(stretch) < 2.0 * float(limit)
 
 
 def test_planting_refuses_a_pair_that_is_not_there(tmp_path, capsys):

@@ -128,9 +128,7 @@ def test_no_modules_import_each_other() -> None:
 
 
 def test_nothing_inside_goes_through_a_door() -> None:
-    assert not {
-        module: used(module) & DOORS.keys() for module in MODULES if used(module) & DOORS.keys()
-    }
+    assert not [module for module in MODULES if used(module) & DOORS.keys()]
 
 
 @pytest.mark.parametrize("door", DOORS)

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
+from stubs import in_this_process
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train_high
@@ -559,7 +560,7 @@ def test_calibration_ends_a_run_of_the_low_policy(
     monkeypatch.setattr(calibration, "_ROBOTS", 12)
     monkeypatch.setattr(calibration, "_WALK_SECONDS", 1.5)
     monkeypatch.setattr(calibration, "_SETTLE_SECONDS", 0.7)
-    monkeypatch.setattr(calibration, "run_jobs", lambda work, jobs, workers: map(work, jobs))
+    monkeypatch.setattr(calibration, "run_jobs", in_this_process)
     arguments = [*TINY, "--steps", "32", "--set", "calibration.robots=64"]
     arguments += ["--set", "calibration.turns=1"]
     whole, broken = tmp_path / "whole", tmp_path / "broken"

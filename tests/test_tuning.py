@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from test_drivers import save_high
 from test_evaluation import rows_of
 
@@ -246,6 +248,39 @@ def test_paths_that_are_no_files(tmp_path):
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe{}")
     with pytest.raises(ConfigError, match=r"bytes.json: not a JSON file$"):
         load(tmp_path / "bytes.json")
+
+
+KEYS = st.sampled_from(
+    ["decoder", "vx", "low", "high", "gaits", "decision_rate", "safety", "x", ""]
+)
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.sampled_from([*GAITS, "NaN", "\n"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@settings(deadline=None)
+@given(st.dictionaries(KEYS, VALUES, max_size=3), st.lists(st.text(max_size=12), max_size=2))
+def test_anything_else_is_a_tuning_or_one_line(tmp_path_factory, data, texts):
+    path = tmp_path_factory.mktemp("fuzz") / "tuning.json"
+    path.write_text(json.dumps(data), encoding="utf-8")
+    keys = ["decoder.vx.high=", "decision_rate=", "decoder.gaits=", ""]
+    assignments = [key + text for key, text in zip(keys, texts, strict=False)]
+    try:
+        found = load(path, assignments)
+        check(found, HIGH, LOW)
+    except ConfigError as error:
+        assert len(str(error).splitlines()) == 1
+    else:
+        ranges = tuned_ranges(found, HIGH, LOW)
+        for name in CONTINUOUS:
+            (low, high), (bottom, top) = getattr(LOW.commands, name), getattr(ranges, name)
+            assert low <= bottom <= top <= high
 
 
 # ------------------------------------------------------------------ beside the untuned run

@@ -273,6 +273,5 @@ def write(folder: Path) -> Path:
         OSError, ValueError: as ``render``, or the page cannot be written.
     """
     path = folder / NAME
-    text = render(folder)
-    write_text(path, text)
+    write_text(path, render(folder))
     return path
