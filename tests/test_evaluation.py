@@ -118,13 +118,13 @@ def test_a_cell_is_complete_with_all_of_its_batches(low, monkeypatch):
 def test_conditions_are_the_benchmarks():
     assert list(CONDITIONS) == [
         "nominal", "levels-11-12", "mixed", "friction-0.4", "payload-3kg", "pushes", "motor-0.85",
-        "latency-30ms", "physics-1000hz", "noise", "no-family",
-        "mirrored",
+        "armature-0.01", "latency-30ms", "physics-1000hz", "noise", "no-family", "mirrored",
     ]  # fmt: skip
     assert CONDITIONS["friction-0.4"].friction == 0.4
     assert CONDITIONS["payload-3kg"].payload == 3.0
     assert CONDITIONS["pushes"].push_speed == 0.75
     assert CONDITIONS["motor-0.85"].motor == 0.85
+    assert CONDITIONS["armature-0.01"].armature == 0.01
     assert CONDITIONS["latency-30ms"].latency == 0.03
 
 

@@ -61,7 +61,8 @@ def snapshot(world: World) -> Array:
     """Everything measured in the last step, one row per robot, (M, n)."""
     s = world.state
     flat = [s.position, s.quaternion, s.lin_vel, s.ang_vel, s.q, s.qd, s.torque]
-    return np.column_stack([*flat, s.foot_force, s.leg_force, s.trunk_force])
+    forces = [s.foot_force, s.leg_force, s.trunk_force, s.rotor_excess]
+    return np.column_stack([*flat, *forces])
 
 
 @pytest.fixture
@@ -284,21 +285,6 @@ def test_all_links_have_the_friction_of_the_physics_until_they_are_given_another
     links = range(-1, client.getNumJoints(body))
     assert {client.getDynamicsInfo(body, link)[1] for link in links} == {0.7}
     world.close()
-
-
-def test_armature_is_inertia_about_the_joints(plane: World) -> None:
-    """It adds to each link's inertia about its joint's axis, and a new value replaces the last."""
-    client, body = plane._client_of[0], plane._bodies[0]
-
-    def inertia() -> Array:
-        return np.array([client.getDynamicsInfo(body, joint)[2] for joint in plane._joints])
-
-    before = inertia()
-    for armature in (0.02, 0.01):
-        plane.set_dynamics([0], np.array([0.8]), np.zeros(1), np.array([armature]))
-    added = (inertia() - before).reshape(4, 3, 3)
-    # Hips turn about x, thighs and calves about y.
-    np.testing.assert_allclose(added, [0.01 * np.eye(3)[[0, 1, 1]]] * 4, atol=1e-9)
 
 
 def test_joint_friction_holds_a_joint_back(plane: World) -> None:
@@ -573,7 +559,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
     def anew() -> World:
         other = World(m, ROBOT, PHYSICS, field)
         other.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0), np.full(m, 0.01))
-        for name in ("position", "quaternion", "lin_vel", "ang_vel", "q", "qd"):
+        for name in ("position", "quaternion", "lin_vel", "ang_vel", "q", "qd", "rotor_excess"):
             getattr(other.state, name)[:] = getattr(world.state, name)
         other.state.derive()
         other.forget()

@@ -61,6 +61,7 @@ class Condition:
     payload: float = 0.0  # kg
     push_speed: float = 0.0  # m/s, every 3 s
     motor: float = 1.0  # factor on torque limits and gains
+    armature: float = 0.0  # kg m^2, rotor inertia of each joint
     latency: float = 0.0  # s
     physics_hz: int | None = None
     noise: RandomisationConfig | None = None  # of the sensors; also starts the gait clock at random
@@ -81,6 +82,7 @@ CONDITIONS: dict[str, Condition] = {
     "payload-3kg": Condition("3 kg on the trunk", payload=3.0),
     "pushes": Condition(f"pushes of 0.75 m/s every {PUSH_INTERVAL:g} s", push_speed=0.75),
     "motor-0.85": Condition("0.85 times the torque limits and gains of the joints", motor=0.85),
+    "armature-0.01": Condition("rotors of 0.01 kg m^2 in the joints", armature=0.01),
     "latency-30ms": Condition("commands reach the joints 30 ms late", latency=0.03),
     "physics-1000hz": Condition("physics at 1000 Hz", physics_hz=1000),
     "noise": Condition(
@@ -276,6 +278,7 @@ class Batch:
         self.loco, self.origin = loco, self.field.origin(rows, 0)
         loco.friction[:] = physics.friction if condition.friction is None else condition.friction
         loco.payload[:], loco.delay[:] = condition.payload, condition.latency
+        loco.armature[:] = condition.armature
         loco.world.strength[:] = condition.motor
         loco.apply_dynamics(rows)
         start, self.goal = self.field.starts[:, 0], self.field.goals[:, 0] + self.origin

@@ -28,7 +28,7 @@ from tdgc.errors import InputError
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and the one before in case that is damaged
-_VERSION = 12  # since the teacher reads the heights
+_VERSION = 13  # since the torques of rotors are part of the state
 #: Tensor names of the recurrent learner's LSTM states in the current episodes.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 

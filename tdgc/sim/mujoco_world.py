@@ -104,7 +104,7 @@ class MujocoWorld(World):
         self._part = self._parts()
         trunk = self.model.body(1)
         self._trunk = trunk.mass.copy(), trunk.inertia.copy()
-        self._armature = config.armature
+        self._rotor = config.armature
 
     def _parts(self) -> NDArray[np.int64]:
         """Code of the part that each geom belongs to."""
@@ -143,7 +143,7 @@ class MujocoWorld(World):
         share = (mass + payload) / mass  # the payload is spread over the trunk: inertia scales too
         model.body(1).mass, model.body(1).inertia = share * mass, share * inertia
         model.geom_friction[:, 0] = friction[0]  # MuJoCo takes the larger of two in contact
-        model.dof_armature[self._qd] = self._armature + armature
+        model.dof_armature[self._qd] = self._rotor + armature
         mujoco.mj_setConst(model, mujoco.MjData(model))  # on scratch data, as it moves the robot
 
     def retire(self, index: ArrayLike) -> None:

@@ -330,6 +330,8 @@ class RobotState:
         leg_force: the same on each leg above the foot (hip, thigh and calf), (M, 4) N.
         trunk_force: largest normal force on the trunk in the control step, (M,) N; in Bullet read
             once per joint control.
+        rotor_excess: torques on joints and trunk that are given back in the next joint control,
+            (M, 15) N m, see ``tdgc.sim.rotors``; 0 in MuJoCo.
     """
 
     geometry: Geometry
@@ -343,6 +345,7 @@ class RobotState:
     foot_force: Array
     leg_force: Array
     trunk_force: Array
+    rotor_excess: Array
     rotation: Array = field(init=False)
     yaw: Array = field(init=False)
     gravity: Array = field(init=False)
@@ -360,7 +363,8 @@ class RobotState:
         arrays = [np.zeros((m, n)) for n in (3, 3, 12, 12, 12, 4, 4)]
         lin, ang, q, qd, torque, foot, leg = arrays
         trunk = np.zeros((m, 3)), quaternion, lin, ang
-        state = cls(geometry, *trunk, q, qd, torque, foot, leg, np.zeros(m))
+        forces = foot, leg, np.zeros(m)
+        state = cls(geometry, *trunk, q, qd, torque, *forces, np.zeros((m, NUM_JOINTS + 3)))
         state.derive()
         return state
 

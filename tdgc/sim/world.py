@@ -30,6 +30,7 @@ from tdgc.sim.robot import (
     quaternion_product,
     rotation_matrix,
 )
+from tdgc.sim.rotors import excess_momentum
 from tdgc.sim.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
 from tdgc.sim.urdf import JOINTS, merged_file, urdf_path
 
@@ -128,11 +129,13 @@ class World:
         with merged_file(robot) as urdf:
             for rows in np.array_split(np.arange(num_robots), parts):
                 self._connect(rows, urdf, window)
-        self._joint_inertia = [self._inertia_about_joint(joint) for joint in self._joints]
         trunk = self._client_of[0].getDynamicsInfo(self._bodies[0], _TRUNK)
         # Bullet's pose of a robot is that of the trunk's inertial frame: these are the centre of
         # mass and the orientation of the principal axes in the trunk's frame.
-        self._trunk_inertia, self._centre, self._axes = map(np.array, trunk[2:5])
+        self._centre, self._axes = map(np.array, trunk[3:5])
+        self._to_axes = rotation_matrix(self._axes[None])[0].T
+        self._inertia = {link: self._links_inertia(link) for link in (_TRUNK, *self._joints)}
+        self._armature = np.zeros(num_robots)
         self._active = np.arange(num_robots)
 
     def _connect(self, rows: NDArray[np.int64], urdf: Path, window: bool) -> None:
@@ -270,7 +273,7 @@ class World:
         state = self.state
         for k, i in enumerate(index):
             state.position[i], state.quaternion[i], state.q[i] = position[k], quaternion[k], q[k]
-            for still in (state.lin_vel, state.ang_vel, state.qd, state.torque):
+            for still in (state.lin_vel, state.ang_vel, state.qd, state.torque, state.rotor_excess):
                 still[i] = 0.0
             state.foot_force[i] = state.leg_force[i] = 0.0
             state.trunk_force[i] = 0.0
@@ -334,20 +337,24 @@ class World:
         for i in self._active:
             self._put(int(i))
 
-    def _inertia_about_joint(self, joint: int) -> tuple[list[float], int]:
-        """Principal inertia of a joint's link, (3,) kg m^2, and the index of the principal axis
-        closest to the joint's, which Bullet gives in the principal axes' frame."""
-        client, body = self._client_of[0], self._bodies[0]
-        inertia, axis = client.getDynamicsInfo(body, joint)[2], client.getJointInfo(body, joint)[13]
-        return list(inertia), int(np.abs(axis).argmax())
+    def _links_inertia(self, link: int) -> tuple[Array, Array]:
+        """A link's inertia about its principal axes, (3,) kg m^2, and the number of rotors that
+        turn about the axis closest to each, (3,): of its own joint and of those it carries."""
+        _, _, inertia, _, quaternion, *_ = self._client_of[0].getDynamicsInfo(self._bodies[0], link)
+        part = -1 if link == _TRUNK else self._joints.index(link) % 3
+        forward, leftward = [(4, 0), (1, 1), (0, 2), (0, 1)][part + 1]  # trunk, hip, thigh, calf
+        axes = np.abs(rotation_matrix(np.array([quaternion]))[0])  # one in each column
+        rotors = np.zeros(3)
+        rotors[axes[0].argmax()] += forward
+        rotors[axes[1].argmax()] += leftward
+        return np.array(inertia), rotors
 
     def set_dynamics(
         self, index: ArrayLike, friction: Array, payload: Array, armature: Array
     ) -> None:
         """Set the friction of all links, the trunk's payload and the rotor inertia of the joints.
 
-        Bullet's joints have no inertia of their own, so it is added to the links' inertia about
-        their joints. Unlike a rotor's, it also resists rotation of all links together.
+        The last is as in ``tdgc.sim.rotors``.
 
         Args:
             index: (n,) robots.
@@ -357,21 +364,17 @@ class World:
         """
         nominal = self.state.geometry.trunk_mass
         for k, i in enumerate(np.asarray(index)):
+            self._armature[i] = armature[k]
             body, client = self._bodies[i], self._client_of[i]
             mass = nominal + float(payload[k])
             for link in (_TRUNK, *sorted(self._joints)):
                 client.changeDynamics(body, link, lateralFriction=float(friction[k]))
-            for joint, (inertia, axis) in zip(self._joints, self._joint_inertia, strict=True):
-                about = inertia.copy()
-                about[axis] += float(armature[k])
-                client.changeDynamics(body, joint, localInertiaDiagonal=about)
-            # The payload is spread over the trunk, so the inertia scales with the mass.
-            client.changeDynamics(
-                body,
-                _TRUNK,
-                mass=mass,
-                localInertiaDiagonal=(self._trunk_inertia * (mass / nominal)).tolist(),
-            )
+            client.changeDynamics(body, _TRUNK, mass=mass)  # first: it resets the inertia
+            for link, (inertia, rotors) in self._inertia.items():
+                # The payload is spread over the trunk, so the inertia scales with the mass.
+                grown = inertia * (mass / nominal) if link == _TRUNK else inertia
+                about = (grown + float(armature[k]) * rotors).tolist()
+                client.changeDynamics(body, link, localInertiaDiagonal=about)
 
     def push(self, index: ArrayLike, velocity: Array) -> None:
         """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index``, and refresh
@@ -426,16 +429,30 @@ class World:
         """
         joints, state = self._joints, self.state
         bodies = [self._bodies[i] for i in live]
+        dt = self.physics.hold * self.physics.dt
         # Called for every robot and joint control; even a client's bound functions are too slow.
         command, measure = pybullet.setJointMotorControlArray, pybullet.getJointStates
         strength, friction = self.strength[live], self.joint_friction[live]
         q, qd = state.q[live], state.qd[live]
+        armature, excess = self._armature[live], state.rotor_excess[live]
+        rotors = armature.any()
+        if not rotors:
+            excess[:] = 0.0
+        else:
+            rotation, momentum, _ = self._excess(client, bodies, q, qd)
         for target in wanted:
             torque = pd_torque(target - q, qd, strength, self.robot, friction)
-            for body, forces in zip(bodies, torque.tolist(), strict=True):
+            applied = torque + excess[:, :NUM_JOINTS]
+            for body, forces in zip(bodies, applied.tolist(), strict=True):
                 command(
                     body, joints, pybullet.TORQUE_CONTROL, forces=forces, physicsClientId=client.id
                 )
+            if rotors:
+                about = (rotation @ excess[:, NUM_JOINTS:, None])[..., 0].tolist()
+                for body, turn in zip(bodies, about, strict=True):
+                    pybullet.applyExternalTorque(
+                        body, _TRUNK, turn, pybullet.WORLD_FRAME, physicsClientId=client.id
+                    )
             started = time.perf_counter()
             client.stepSimulation()
             self.bullet_seconds += time.perf_counter() - started
@@ -444,6 +461,10 @@ class World:
                 np.fromiter(map(itemgetter(k), flat), np.float64, len(flat)).reshape(q.shape)
                 for k in (0, 1)
             )
+            if rotors:
+                before = momentum
+                rotation, momentum, turning = self._excess(client, bodies, q, qd)
+                excess = armature[:, None] * ((momentum - before) / dt + turning)
             pressed: dict[int, float] = {}  # row -> N on its trunk, usually empty
             for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=_TRUNK):
                 row = client.rows[contact[2]]
@@ -451,6 +472,17 @@ class World:
             for row, force in pressed.items():
                 state.trunk_force[row] = max(force, state.trunk_force[row])
         state.q[live], state.qd[live], state.torque[live] = q, qd, torque
+        state.rotor_excess[live] = excess
+
+    def _excess(
+        self, client: _Client, bodies: list[int], q: Array, qd: Array
+    ) -> tuple[Array, Array, Array]:
+        """Rotation matrices of the trunks of ``bodies`` (n,), (n, 3, 3), and
+        ``excess_momentum``."""
+        turned = [pybullet.getBasePositionAndOrientation(body, client.id)[1] for body in bodies]
+        ang_vel = np.array([pybullet.getBaseVelocity(body, client.id)[1] for body in bodies])
+        rotation = rotation_matrix(np.array(turned)) @ self._to_axes
+        return rotation, *excess_momentum((ang_vel[:, None] @ rotation)[:, 0], q, qd)
 
     def _force(self, contact: tuple[Any, ...]) -> float:
         """Normal force of a contact in N.
