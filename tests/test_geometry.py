@@ -109,15 +109,16 @@ def test_settings_for_another_robot(a1: RobotConfig, robot: RobotConfig) -> None
     """The A1: 12.458 kg to our 12.6, legs of 0.4 m to our 0.426, motor limits from its URDF."""
     found = fitted(a1)
     assert found == {
-        "base_height": 0.28, "kp": 18.6, "kd": 0.54,
+        "base_height": 0.28, "stance": (0.38, 0.26), "kp": 18.6, "kd": 0.54,
         "torque_limit": (20.0, 55.0, 55.0), "speed_limit": (52.4, 28.6, 28.6),
     }  # fmt: skip
+    assert fitted(robot)["stance"] == (0.44, 0.3)
     assert fitted(robot)["kp"] == pytest.approx(20.0 * 15.4 / 12.6 * 0.5 / 0.426, abs=0.05)
 
 
 def test_a_urdf_that_says_nothing_of_its_motors(tmp_path: Path) -> None:
     silent = changed(tmp_path, (' effort="23.7" velocity="30"', ""))
-    assert set(fitted(silent)) == {"base_height", "kp", "kd"}
+    assert set(fitted(silent)) == {"base_height", "stance", "kp", "kd"}
     with pytest.raises(ConfigError, match=r"limit effort must be at least 0, not -1$"):
         fitted(changed(tmp_path, ('effort="35.5"', 'effort="-1"')))
 

@@ -66,7 +66,7 @@ def test_the_high_policy_was_trained_with_the_defaults() -> None:
     meta = policies.load(PRETRAINED / "high").meta
     assert meta["teacher"] == plain(TeacherConfig())
     assert recorded(HighLevelConfig, meta["config"], "high") == config.env
-    assert meta["low"]["config"] == plain(low)
+    assert recorded(LowLevelConfig, meta["low"]["config"], "high") == low
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ def low_step(**changes: object) -> LowStep:
         base_height=np.full(2, 0.30),
         foot_height=np.full((2, 4), GEOMETRY.foot_radius),
         standing_height=0.30,
+        stance=RobotConfig().stance,
         targets=np.zeros((3, 2, 12)),
         actions=np.zeros((2, 2, 12)),
         acceleration=np.zeros((2, 12)),
@@ -154,7 +155,7 @@ def test_vertical_velocity_and_tilt_rate() -> None:
 def raibert(phase: float, duration: float = 0.5, frequency: float = 2.0, **command: float) -> Array:
     """Footholds of one robot with all feet at the same phase, (4, 2) m."""
     step = set_command(low_step(), duration=duration, frequency=frequency, **command)
-    return rewards.raibert_targets(step.command[1:], np.full((1, 4), phase))[0]
+    return rewards.raibert_targets(step.command[1:], np.full((1, 4), phase), step.stance)[0]
 
 
 RECTANGLE = np.array([[0.19, 0.125], [0.19, -0.125], [-0.19, 0.125], [-0.19, -0.125]])
@@ -165,6 +166,15 @@ def test_raibert_rests_under_the_commanded_rectangle() -> None:
     np.testing.assert_allclose(raibert(0.25, vx=1.0, vy=0.5), RECTANGLE, atol=1e-12)
     wide = raibert(0.7, stance_width=0.35, stance_length=0.33)
     np.testing.assert_allclose(wide, np.sign(GEOMETRY.hips) * [0.165, 0.175], atol=1e-12)
+
+
+def test_raibert_rests_at_another_robots_stance() -> None:
+    """At the default commands; others move the feet as far from there as from ours."""
+    command, phases = low_step().command, np.full((2, 4), 0.25)
+    command[1, INDEX["stance_width"]] += 0.08
+    made = rewards.raibert_targets(command, phases, (0.6, 0.4))
+    signs = np.sign(GEOMETRY.hips)
+    np.testing.assert_allclose(made, [signs * [0.3, 0.2], signs * [0.3, 0.24]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,10 @@ class RobotConfig:
     # random targets within 1.5 rad drive feet through the ground, within 1 rad they do not.
     action_limit: Positive = 4.0
     base_height: Positive = 0.30  # m, standing (benchmark)
+    # m, length and width between the footholds at the default commands, which have these values.
+    stance: tuple[Positive, Positive] = field(
+        default=(0.38, 0.25), metadata={"before": (0.38, 0.25)}
+    )
     # Whether q0 follows the commanded behaviour (``robot.commanded_pose``); fixed in the paper.
     commanded_pose: bool = True
     # Whether q0 also walks: it carries the robot's weight, and its feet follow Raibert's footholds

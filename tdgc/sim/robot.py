@@ -53,11 +53,18 @@ def check_nominal_pose(config: RobotConfig, geometry: Geometry) -> None:
             )
 
 
+def _between_thighs(geometry: Geometry) -> Array:
+    """Distances between front and rear and between left and right thigh joints, (2,) m."""
+    length, width = np.ptp(geometry.hips, axis=0)
+    return np.array([length, width + 2.0 * geometry.abduction])
+
+
 def fitted(config: RobotConfig) -> dict[str, Any]:
     """Settings for the robot whose URDF ``config`` names, by field: motor limits from the URDF, and
     the shipped robot's settings scaled to its size and mass.
 
-    ``base_height`` is the same share of the nominal pose's height. ``kp`` scales with the weight's
+    ``base_height`` is the same share of the nominal pose's height, ``stance`` of the distances
+    between the thigh joints. ``kp`` scales with the weight's
     torque about the joints, m g l, and ``kd`` with m l^1.5, which keeps the damping ratio.
     """
     ours, own = RobotConfig(), read_geometry(config)
@@ -65,8 +72,10 @@ def fitted(config: RobotConfig) -> dict[str, Any]:
     mass = sum(own.masses.values()) / sum(shipped.masses.values())
     length = (own.thigh + own.calf) / (shipped.thigh + shipped.calf)
     height = nominal_height(config, own) / nominal_height(ours, shipped)
+    stance = np.multiply(ours.stance, _between_thighs(own) / _between_thighs(shipped))
     found: dict[str, Any] = {
         "base_height": round(height * ours.base_height, 2),
+        "stance": tuple(stance.round(2).tolist()),
         "kp": round(mass * length * ours.kp, 1),
         "kd": round(mass * length**1.5 * ours.kd, 2),
     }

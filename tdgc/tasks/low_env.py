@@ -234,6 +234,7 @@ class LowLevelTask:
             base_height=self.ground.base,
             foot_height=self.ground.feet,
             standing_height=c.robot.base_height,
+            stance=c.robot.stance,
             targets=loco.targets,
             actions=loco.actions,
             acceleration=(loco.world.state.qd - speed_before) / c.physics.control_dt,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdgc.config import HighRewardConfig, LowRewardConfig
-from tdgc.sim.commands import INDEX
+from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.geometry import FRONT, SIDE
 from tdgc.sim.robot import Array, RobotState, foot_travel
 
@@ -22,6 +22,7 @@ CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact
 _SOFT_LIMIT = 0.9  # share of a joint's range without a penalty (Walk These Ways)
 _FORCE_SCALE = 100.0  # N^2, swing contact force (Walk These Ways)
 _SPEED_SCALE = 10.0  # m^2/s^2, stance foot speed (Walk These Ways)
+_STANCE = [INDEX["stance_length"], INDEX["stance_width"]]
 _LEG_FORCE = 0.1  # N, above which a leg contact counts (Walk These Ways)
 
 
@@ -37,6 +38,7 @@ class LowStep:
         base_height: (M,) m, trunk above the ground under it.
         foot_height: (M, 4) m, foot centre above the support surface under it.
         standing_height: m, to which the body height command is added.
+        stance: (2,) m, length and width between the footholds at the default commands.
         targets: (3 or more, M, 12) rad, joint targets of this step and the two before.
         actions: (2, M, 12), this action and the one before.
         acceleration: (M, 12) rad/s^2 of the joints over the step.
@@ -53,6 +55,7 @@ class LowStep:
     base_height: Array
     foot_height: Array
     standing_height: float
+    stance: tuple[float, float]
     targets: Array
     actions: Array
     acceleration: Array
@@ -98,15 +101,15 @@ def orientation(s: LowStep) -> Array:
     return _square_sum((s.state.gravity - wanted)[:, :2])
 
 
-def raibert_targets(command: Array, phases: Array) -> Array:
+def raibert_targets(command: Array, phases: Array, stance: tuple[float, float]) -> Array:
     """Footholds of Raibert's rule in the heading frame: (M, 15), (M, 4) -> (M, 4, 2) m.
 
-    They are the corners of the commanded stance rectangle, shifted by ``robot.foot_travel``.
+    They are the corners of the commanded stance rectangle, shifted by ``robot.foot_travel``. Its
+    length and width differ from ``stance`` (2,) m, those of the robot at the default commands, as
+    the commands do from their defaults.
     """
-    half = 0.5 * np.stack(
-        [command[:, INDEX["stance_length"]], command[:, INDEX["stance_width"]]], axis=-1
-    )
-    rest = half[:, None, :] * np.stack([FRONT, SIDE], axis=1)
+    rectangle = command[:, _STANCE] + (np.array(stance) - default_command()[_STANCE])
+    rest = 0.5 * rectangle[:, None, :] * np.stack([FRONT, SIDE], axis=1)
     return np.asarray(rest + foot_travel(command, phases, rest))
 
 
@@ -115,7 +118,7 @@ def raibert_foothold(s: LowStep) -> Array:
     arm = s.state.foot_position[..., :2] - s.state.position[:, None, :2]
     c, d = np.cos(s.state.yaw)[:, None], np.sin(s.state.yaw)[:, None]
     feet = np.stack([c * arm[..., 0] + d * arm[..., 1], c * arm[..., 1] - d * arm[..., 0]], axis=-1)
-    error = feet - raibert_targets(s.command, s.phases)
+    error = feet - raibert_targets(s.command, s.phases, s.stance)
     return np.asarray(np.einsum("mfi,mfi->m", error, error))
 
 
