@@ -27,7 +27,7 @@ from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, Teac
 from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, plan, run_cell
 from tdgc.benchmark.flags import add_arguments, choose, read
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import FILES, STOPS, describe, salvage, what_stopped, write_results
+from tdgc.benchmark.results import STOPS, describe, make_room, salvage, what_stopped, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
@@ -38,7 +38,7 @@ from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.jobs import RunJobs, run_jobs
-from tdgc.policies import Policy, load
+from tdgc.policies import Policy
 from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.world import WindowError
@@ -51,6 +51,7 @@ POLICIES = ("tdgc", "gp")
 TEACHER = "teacher"
 CUES = "cues"
 ALL_POLICIES = (*POLICIES, CUES, TEACHER)
+_LOW_ALONE = ("tracking", "drive")  # modes without a driver
 TUNED = "tdgc-tuned"  # evaluated beside "tdgc" if there is a tuning
 SHIPPED_HIGH = PRETRAINED / "high"
 
@@ -143,7 +144,7 @@ class Evaluation:
     def __post_init__(self) -> None:
         if self.traced is not None:
             require("a trace", ("pyarrow",), "trace")
-        if "tdgc" in self.policies and self.high is None and self.mode != "tracking":
+        if "tdgc" in self.policies and self.high is None and self.mode not in _LOW_ALONE:
             raise ValueError("no high policy is shipped: give one with --high, or --policies gp")
         self._check_mode()
         if self.tuning is not None and "tdgc" not in self.policies:
@@ -242,7 +243,7 @@ class Evaluation:
             ValueError: a high policy that does not fit the low one, or a tuning that does not fit
                 them.
         """
-        if self.mode == "tracking":
+        if self.mode in _LOW_ALONE:
             return {}
         drivers: dict[str, Driver] = {}
         skill = self.skill(low, config) if {CUES, TEACHER} & set(self.policies) else None
@@ -266,22 +267,13 @@ class Evaluation:
         return drivers
 
     def make_room(self) -> None:
-        """Create the results folder.
-
-        For a table, it also deletes the files of an earlier one, because this one may not overwrite
-        all of them.
-        """
-        self.out.mkdir(parents=True, exist_ok=True)
+        """Create the results folder; only a table replaces an earlier one there."""
         if self.mode != "table":
+            self.out.mkdir(parents=True, exist_ok=True)
             return
-        left = ["films/film_*", "films/sheet_*", "films/strip_*", "traces/*.parquet"]
-        left += ["diagnosis.csv", "tuning.json", report.NAME, *FILES]
+        left = ["traces/*.parquet", "diagnosis.csv", "tuning.json", report.NAME]
         left += [name for name, *_ in report.FIGURES]
-        for old in [path for pattern in left for path in self.out.glob(pattern)]:
-            old.unlink()
-        for folder, wanted in (("films", self.filmed > 0), ("traces", self.traced is not None)):
-            if wanted:
-                (self.out / folder).mkdir(exist_ok=True)
+        make_room(self.out, left, {"films": self.filmed > 0, "traces": self.traced is not None})
 
 
 @dataclass(frozen=True)
@@ -326,16 +318,13 @@ def run_one(
     )
 
 
-def run_table(
-    evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver], trained_on: dict[str, int]
-) -> list[str]:
+def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> list[str]:
     """Run all cells and write all results.
 
     Args:
         evaluation: what to run.
         low: the low policy.
         drivers: of all policies, by name.
-        trained_on: ``editions`` of the policies.
 
     Returns:
         What could not be written, one line each.
@@ -343,7 +332,7 @@ def run_table(
     Raises:
         Exception: one of ``STOPS``; the table of the complete cells is written first.
     """
-    e, out = evaluation, evaluation.out
+    e, out, trained_on = evaluation, evaluation.out, editions(low, drivers)
     cells = plan(list(drivers), e.conditions, e.families, e.levels, e.episodes)
     work = functools.partial(
         run_one, low=low, drivers=drivers, seed=e.seed, filmed=e.filmed, traced=e.traced
@@ -386,15 +375,15 @@ def run_table(
     return problems
 
 
-def editions(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> dict[str, int]:
+def editions(low: Policy, drivers: Mapping[str, Driver]) -> dict[str, int]:
     """Editions of the benchmark that the policies were trained on.
 
     Policies that do not record an edition are of the first.
     """
     used = {"low": low}
-    if "tdgc" in drivers:
-        assert evaluation.high is not None
-        used["high"] = load(evaluation.high)
+    pair = drivers.get("tdgc")
+    if isinstance(pair, HierarchyDriver) and isinstance(pair.high, Policy):
+        used["high"] = pair.high
     return {name: int(policy.meta.get("benchmark", 1)) for name, policy in used.items()}
 
 
@@ -428,7 +417,7 @@ def run_tracking(evaluation: Evaluation, low: Policy) -> None:
 
 def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> None:
     """Show a robot on the first tile of the first family and level until the window is closed."""
-    policy = next(iter(drivers))
+    policy = next(iter(drivers), "")  # nobody drives but the user
     if policy == "tdgc" and TUNED in drivers:
         policy = TUNED
     cell = Cell(policy, "nominal", evaluation.families[0], evaluation.levels[0], 0, 1)
@@ -450,7 +439,6 @@ def main(arguments: list[str] | None = None) -> int:
         low, config = load_low(evaluation.low)
         read_geometry(config.robot)  # before the results of an earlier call are removed
         drivers = evaluation.drivers(low, config)
-        trained_on = editions(evaluation, low, drivers)  # before training overwrites the file
         evaluation.make_room()
     except (ValueError, OSError) as error:
         fail(error)
@@ -460,7 +448,7 @@ def main(arguments: list[str] | None = None) -> int:
         if evaluation.mode == "tracking":
             run_tracking(evaluation, low)
         elif evaluation.mode == "table":
-            problems = run_table(evaluation, low, drivers, trained_on)
+            problems = run_table(evaluation, low, drivers)
         else:
             run_window(evaluation, low, drivers)
     except (InputError, WindowError) as error:  # no robot, terrain or window where it is needed

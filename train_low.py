@@ -116,12 +116,20 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
     run is resumed, with the same result. Without calibration the policy is only marked as final.
 
     Raises:
-        ConfigError: the robots fall too often to be calibrated.
+        ConfigError: the robots fall too often to be calibrated, or the policy was calibrated with
+            other settings.
         WorkerError: a worker failed.
     """
     learned = policies.load(out / "policy")
     robots, done = config.calibration.robots, learned.meta.pop("calibration", None)
     if done is not None and (done["robots"] or not robots):
+        asked = {"robots": robots, "turns": config.calibration.turns}
+        for name in ("robots", "turns") if robots else ():
+            if done[name] != asked[name]:
+                raise ConfigError(
+                    f"{out / 'policy'} is already calibrated, with 'calibration.{name}' "
+                    f"{done[name]}, not {asked[name]}; python -m tdgc.calibration does it again"
+                )
         return
     if not robots:
         meta = {**learned.meta, "calibration": {"robots": 0}}

@@ -55,6 +55,7 @@ LOAD_ROBOTS, LOAD_WORKERS, LOAD_THREADS = (10, 100, 1000), (1, 2, 4, 8), (1, 2, 
 _SETTLE_STEPS = 20  # not timed, while robots drop onto their feet
 _EPISODE = 100  # decisions, about the mean in the shipped high policy's training
 _TURNS = 10  # of each place in a comparison
+_ROBOTS, _SECONDS = 100, 10.0  # of a measurement, by default
 
 
 def spread_levels(env: TaskVecEnv, levels: int) -> None:
@@ -315,6 +316,24 @@ def compare_places(robots: int, workers: int, seconds: float) -> dict[str, Any]:
     return result
 
 
+def check_flags(args: argparse.Namespace) -> None:
+    """Check the flags, and fill in the defaults of those that were not given.
+
+    Raises:
+        InputError: something was given that the comparison does not use, or is not allowed.
+    """
+    own = {"load": ("robots", "workers"), "update": ("robots", "workers", "seconds")}
+    for what, names in own.items():
+        for name in names if getattr(args, what) else ():
+            if getattr(args, name) is not None:
+                raise InputError(f"--{what} has its own settings: no --{name}")
+    for name, default in (("robots", _ROBOTS), ("workers", "auto"), ("seconds", _SECONDS)):
+        if getattr(args, name) is None:
+            setattr(args, name, default)
+    if not 0.0 < args.seconds < math.inf:
+        raise InputError(f"--seconds must be above 0, not {args.seconds:g}")
+
+
 def choose_workers(args: argparse.Namespace) -> int:
     """The number of workers that ``--workers`` asks for, after joining the cluster if one is given.
 
@@ -336,17 +355,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.bench", description=(__doc__ or "").partition("\n")[0]
     )
-    parser.add_argument("--robots", type=int, default=100, help="number of robots (100)")
+    parser.add_argument("--robots", type=int, help=f"number of robots ({_ROBOTS})")
     parser.add_argument(
         "--workers",
         type=workers_flag,
-        default="auto",
         metavar="N",
         help="number of workers to compare with one (one per core)",
     )
-    parser.add_argument(
-        "--seconds", type=float, default=10.0, help="length of each measurement (10)"
-    )
+    parser.add_argument("--seconds", type=float, help=f"length of each measurement ({_SECONDS:g})")
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         "--load", action="store_true", help="vary the numbers of robots, workers and threads"
@@ -362,8 +378,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     args = parser.parse_args(arguments)
     try:
-        if not 0.0 < args.seconds < math.inf:
-            raise InputError(f"--seconds must be above 0, not {args.seconds:g}")
+        check_flags(args)
         args.workers = choose_workers(args)
         make_folder(args.out)
     except (InputError, OSError) as error:

@@ -287,7 +287,10 @@ def distil(
                 with th.inference_mode():
                     actions = student(state).numpy()
                 _, terminated, truncated = task.step(np.clip(actions, low.low, low.high))
-                task.reset(np.flatnonzero(terminated | truncated))
+                if np.isfinite(task.locomotion.world.state.position).all():
+                    task.reset(np.flatnonzero(terminated | truncated))
+                else:  # a robot's simulation has blown up
+                    task.restart()
                 lessons.append((state, wanted))
         state, wanted = (th.cat(parts) for parts in zip(*lessons, strict=True))
         with th.inference_mode():

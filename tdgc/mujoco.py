@@ -22,7 +22,7 @@ from tdgc.benchmark import flags
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Batch, Cell, Episode, EpisodeLog, Watcher, closed_loop, plan
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import FILES, STOPS, describe, salvage, what_stopped, write_results
+from tdgc.benchmark.results import STOPS, describe, make_room, salvage, what_stopped, write_results
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
@@ -162,17 +162,6 @@ def run_cell(
     return episodes, recordings
 
 
-def make_room(args: argparse.Namespace) -> None:
-    """Make the results folder and delete the files of an earlier run in it."""
-    args.out.mkdir(parents=True, exist_ok=True)
-    for pattern in ("logs/*.npz", "films/*", "settings.json", *FILES):
-        for old in args.out.glob(pattern):
-            old.unlink()
-    for folder, wanted in (("logs", args.log), ("films", args.video)):
-        if wanted:
-            (args.out / folder).mkdir(exist_ok=True)
-
-
 def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     """Run all cells and write all results; return problems with the films, one line each.
 
@@ -292,7 +281,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = check(args)
         if not args.gui:
-            make_room(args)
+            folders = {"logs": args.log > 0, "films": args.video > 0}
+            make_room(args.out, ["logs/*.npz", "settings.json"], folders)
     except (ValueError, OSError) as error:
         fail(error)
         return 2

@@ -110,6 +110,8 @@ def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("--robots 2 --workers 3", "--workers must be 1 to the number of robots\n"),
         ("--robots 0", "--workers must be 1 to the number of robots\n"),
+        ("--load --workers 2", "--load has its own settings: no --workers\n"),
+        ("--update --seconds 5", "--update has its own settings: no --seconds\n"),
         ("--seconds 0", "--seconds must be above 0, not 0\n"),
         ("--seconds=-1", "--seconds must be above 0, not -1\n"),
         ("--seconds nan", "--seconds must be above 0, not nan\n"),

@@ -206,6 +206,29 @@ def test_a_student_learns_what_is_done_at_corrected_commands(
     assert any(not th.equal(t, low.tensors[name]) for name, t in student.tensors().items())
 
 
+def test_a_robot_that_blows_up_does_not_end_the_lessons(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its world is built again, and the student learns from the others."""
+    monkeypatch.setattr(calibration, "_TURN", 4)
+    low = save_low(tmp_path / "low")
+    task = LowLevelTask(CONFIG, 4, seed=0)
+    step, blown = task.step, []
+
+    def blow_up(actions: Array) -> tuple[Array, Array, Array]:
+        result = step(actions)
+        if not blown:
+            blown.append(task.locomotion.world)
+            task.locomotion.world.state.position[1] = np.nan
+        return result
+
+    monkeypatch.setattr(task, "step", blow_up)
+    student, _, last = distil(low, faster, [task], turns=2, seed=0)
+    assert task.locomotion.world is not blown[0] and np.isfinite(last)
+    assert all(th.isfinite(tensor).all() for tensor in student.tensors().values())
+    task.close()
+
+
 def test_script(
     low: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

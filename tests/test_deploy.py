@@ -211,7 +211,7 @@ def test_the_high_policy_stops_after_the_goal_never_before(folder: Path, tmp_pat
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     path = tmp_path / "high_interface.json"
-    for seconds, steps in ((2.0, 100), (0.0, 0)):
+    for seconds, steps in ((2.0, 100), (3 * 0.1, 15), (0.0, 0)):
         table = json.loads(path.read_text())
         table["task"]["after_goal"]["keep_deciding"]["value"] = seconds
         path.write_text(json.dumps(table))

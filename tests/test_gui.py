@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import evaluate
+from tdgc.config import ConfigError
 from tdgc.show.gui import describe, slider_command
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.world import WindowError, check_display
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 
 def test_sliders_are_the_commands() -> None:
@@ -27,6 +31,16 @@ def test_the_text_says_gait_and_velocities() -> None:
     command[INDEX["vx"]], command[12:] = -0.25, GAIT_TABLE[GAITS.index("bound")]
     text = describe(command)
     assert text == "bound, vx -0.25 m/s, vy 0.00 m/s, yaw_rate 0.00 rad/s"
+
+
+def test_who_drives_needs_no_high_policy_that_fits() -> None:
+    """The low policy may be of a robot that the shipped high policy does not know."""
+    driving = evaluate.Evaluation.of(evaluate.parse(["--gui", "drive", "--workers", "1"]))
+    low, config = load_low(PRETRAINED / "low")
+    other = dataclasses.replace(config, robot=dataclasses.replace(config.robot, kp=30.0))
+    assert driving.drivers(low, other) == {}
+    with pytest.raises(ConfigError, match=r"trained for a low policy with robot.kp 20.0, not 30.0"):
+        dataclasses.replace(driving, mode="watch").drivers(low, other)
 
 
 @pytest.mark.parametrize("display", ["", ":4711"])

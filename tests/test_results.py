@@ -11,7 +11,7 @@ import pytest
 
 from tdgc.benchmark.evaluation import Episode
 from tdgc.benchmark.intervals import paired_interval
-from tdgc.benchmark.results import FILES, compare, describe, summarise, write_results
+from tdgc.benchmark.results import FILES, compare, describe, make_room, summarise, write_results
 
 
 def row(policy: str, family: str, level: int, episode: int, outcome: str) -> Episode:
@@ -23,6 +23,18 @@ def row(policy: str, family: str, level: int, episode: int, outcome: str) -> Epi
 def rows(policy: str, family: str, reached: list[bool]) -> list[Episode]:
     ends = ["reached" if good else "fell" for good in reached]
     return [row(policy, family, 6, k, end) for k, end in enumerate(ends)]
+
+
+def test_room_is_made_in_a_used_folder(tmp_path: Path) -> None:
+    """What an earlier table left goes; files of other names, and folders, stay."""
+    for name in ("films/mine", "films/own.txt", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("") if "." in name else (tmp_path / name).mkdir()
+    for name in (*FILES, "films/film_gp_stair_06_000.gif", "settings.json"):
+        (tmp_path / name).write_text("")
+    make_room(tmp_path, ["settings.json"], {"logs": True, "traces": False})
+    left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
+    assert left == ["films", "films/mine", "films/own.txt", "logs", "notes.txt"]
 
 
 def test_summary_counts_and_averages() -> None:

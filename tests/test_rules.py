@@ -56,6 +56,11 @@ def test_outcomes_are_told_apart(loco: Locomotion) -> None:
     assert names(outcome(loco.world))[0] == "going"  # without a goal nothing is reached
 
 
+def test_a_robot_that_blew_up_has_fallen(loco: Locomotion) -> None:
+    loco.world.state.position[1] = np.nan
+    assert is_fallen(loco.world).tolist() == [False, True, False, False, False]
+
+
 def test_who_falls_into_the_goal_has_fallen(loco: Locomotion) -> None:
     state = loco.world.state
     goal = state.position[:, :2].copy()

@@ -589,6 +589,10 @@ def test_calibration_ends_a_run_of_the_low_policy(
     assert train_low.main([*resumed, "--out", str(later)]) == 0
     assert weights(later) == weights(whole)
     assert "calibration" not in policies.load(later / "uncalibrated").meta
+    again = [*resumed, "--set", "calibration.turns=2", "--out", str(later)]
+    assert train_low.main(again) == 2
+    said = "policy is already calibrated, with 'calibration.turns' 1, not 2; python -m"
+    assert said in "".join(capfd.readouterr())
 
 
 def test_faults_of_a_run(

@@ -279,6 +279,20 @@ def test_payload_adds_its_weight(plane: World, payload: float) -> None:
     np.testing.assert_allclose(inertia, nominal, rtol=1e-6)
 
 
+def test_a_world_that_cannot_be_built_leaves_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    def connected() -> int:
+        return sum(pybullet.isConnected(client) for client in range(64))
+
+    def fail(self: World, *_: object) -> int:
+        raise ValueError("no robot")
+
+    before = connected()
+    monkeypatch.setattr(World, "_load_robot", fail)
+    with pytest.raises(ValueError, match="no robot"):
+        World(2, ROBOT, PHYSICS)
+    assert connected() == before
+
+
 def test_all_links_have_the_friction_of_the_physics_until_they_are_given_another() -> None:
     world = World(1, ROBOT, dataclasses.replace(PHYSICS, friction=0.7))
     client, body = world._client_of[0], world._bodies[0]

@@ -166,10 +166,13 @@ class HierarchyDriver(Driver):
 
     Args:
         high, config: the high policy and its MDP, as ``load_high`` returns them.
+
+    Attributes:
+        high, config: as given.
     """
 
     def __init__(self, high: Decides, config: HighLevelConfig) -> None:
-        self._high, self.config = high, config
+        self.high, self.config = high, config
         assert config.commands is not None  # filled in by ``load_high``
         self.bounds = config.commands
         self._decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
@@ -192,7 +195,7 @@ class HierarchyDriver(Driver):
         decision, held = divmod(step, self.config.decimation)
         if held == 0:
             cues = self._observe(decision)
-            self.action, self._state = self._high.predict(cues, self._state)
+            self.action, self._state = self.high.predict(cues, self._state)
             self._last = self._decoder.normalise(self.action)
             self._command = self._decoder.decode(self.action)
         return self._command

@@ -17,6 +17,7 @@ from tdgc.sim.terrain import EDITION
 
 #: Files written by ``write_results``.
 FILES = ("episodes.csv", "summary.json", "trajectories.npz")
+_FILMS = ("films/film_*", "films/sheet_*", "films/strip_*")
 #: What may stop an evaluation: Ctrl-C, a robot that blows up, a full disk, a dead process.
 STOPS = (KeyboardInterrupt, FloatingPointError, OSError, WorkerError)
 #: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and
@@ -25,6 +26,24 @@ PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
 # The rule of dominance (TDGC-Bench): ``tdgc`` is nowhere significantly below ``gp``. Its lead over
 # ``cues`` is what learning adds to the cues.
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
+
+
+def make_room(out: Path, patterns: Sequence[str], folders: Mapping[str, bool]) -> None:
+    """Create the results folder ``out`` and delete the files of an earlier table in it, because a
+    new one may not overwrite all of them.
+
+    Args:
+        out: the folder.
+        patterns: of files beside ``FILES`` and films.
+        folders: of those that will be needed, by name, whether they are.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    for pattern in (*FILES, *_FILMS, *patterns):
+        for old in out.glob(pattern):
+            old.unlink()
+    for name, wanted in folders.items():
+        if wanted:
+            (out / name).mkdir(exist_ok=True)
 
 
 def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, Any]:

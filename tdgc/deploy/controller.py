@@ -279,8 +279,8 @@ class Controller:
     def over(self, step: int, reached_at: int | None) -> bool:
         """Whether ``high`` has stopped by ``step``: at the horizon, or ``keep_deciding`` seconds
         after step ``reached_at``, in which the goal was reached, if it was."""
-        keep: float = self._task["after_goal"]["keep_deciding"]["value"]
-        held = reached_at is not None and (step - reached_at) * self.dt >= keep
+        keep = round(self._task["after_goal"]["keep_deciding"]["value"] / self.dt)
+        held = reached_at is not None and step - reached_at >= keep
         return step >= self.horizon or held
 
     def step(self, readings: dict[str, Array]) -> Array:

@@ -205,7 +205,7 @@ def _gap(log: Log, controller: Controller) -> str | None:
         (GIVEN, steps[:-1]),
         (DECIDED, log.decisions),
     ):
-        for name in log.values.keys() & set(names):
+        for name in (name for name in names if name in log.values):
             empty = rows[~np.isfinite(log.values[name][rows]).all(axis=1)]
             if empty.size:
                 return f"a gap at {time[empty[0]]:.2f} s: no {name}"

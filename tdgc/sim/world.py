@@ -126,9 +126,13 @@ class World:
         self._bodies: list[int] = []
         self._client_of: list[_Client] = []
         parts = -(-num_robots // CLIENT_ROBOTS)
-        with merged_file(robot) as urdf:
-            for rows in np.array_split(np.arange(num_robots), parts):
-                self._connect(rows, urdf, window)
+        try:
+            with merged_file(robot) as urdf:
+                for rows in np.array_split(np.arange(num_robots), parts):
+                    self._connect(rows, urdf, window)
+        except BaseException:
+            self.close()
+            raise
         trunk = self._client_of[0].getDynamicsInfo(self._bodies[0], _TRUNK)
         # Bullet's pose of a robot is that of the trunk's inertial frame: these are the centre of
         # mass and the orientation of the principal axes in the trunk's frame.
@@ -141,6 +145,7 @@ class World:
     def _connect(self, rows: NDArray[np.int64], urdf: Path, window: bool) -> None:
         """Create a client for the robots ``rows`` (n,), with their ground."""
         client = _Client((int(rows[0]), int(rows[-1]) + 1), window)
+        self._clients.append(client)
         client.setGravity(0.0, 0.0, -GRAVITY)
         # The solver must not stop early: the worst residual would couple the robots.
         client.setPhysicsEngineParameter(
@@ -155,7 +160,6 @@ class World:
             self._bodies.append(self._load_robot(client, k, urdf))
             self._client_of.append(client)
             client.rows[self._bodies[-1]] = int(rows[k])
-        self._clients.append(client)
 
     def _make_ground(self, client: _Client) -> None:
         if self.field is None:

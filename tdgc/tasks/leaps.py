@@ -20,6 +20,7 @@ from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TILE_SIZE
+from tdgc.tasks.executor import Executor
 
 if TYPE_CHECKING:  # the low policy's workers do not load PyTorch
     from tdgc.policies import Policy
@@ -326,13 +327,13 @@ def measure_landing(low: "Policy", config: LowLevelConfig, speed: float) -> Land
     leap_command(loco.command, np.clip(speed / stride, *config.commands.frequency), length)
     places = np.column_stack([np.zeros(_ROBOTS), 2.0 * rows])
     loco.place(rows, places, np.zeros(_ROBOTS), np.linspace(0.0, 1.0, _ROBOTS, endpoint=False))
-    landing, up = Landing(), rows
+    landing, up, executor = Landing(), rows, Executor(loco, low)
     try:
         for step in range(round(_SECONDS / dt)):
             state = loco.world.state
             loco.command[:, INDEX["yaw_rate"]] = np.clip(-state.yaw, *config.commands.yaw_rate)
             before = loco.clock.clock.copy()
-            loco.act(low.predict(loco.observe())[0])
+            executor.step(loco.command)
             up = np.flatnonzero(state.position[:, 2] > 0.5 * config.robot.base_height)
             if step * dt > _SETTLE and up.size:
                 landing.learn(loco, up, before[up], _RATE)

@@ -113,7 +113,8 @@ def arrivals(
     try:
         task.reset(np.arange(robots))
         for _ in range(task.horizon):
-            task.observe()  # the teacher decides
+            if not np.isfinite(task.observe()).all():  # the teacher decides
+                break  # a robot's simulation has blown up, and will corrupt those of the others
             _, failed, _ = task.step(np.zeros((robots, NUM_ACTIONS)))
             lost |= failed & ~task.reached
             if (lost | task.reached).all():

@@ -37,7 +37,8 @@ def outcome(
     if world.field is not None:
         ended[~world.field.on_tile(np.arange(len(x)), 0, x, y)] = LEFT_TILE
     ended[world.state.trunk_force > TRUNK_FORCE] = COLLIDED
-    ended[z - world.support_height(x, y) < FALL_HEIGHT] = FELL
+    # So written that a robot whose simulation has blown up, at NaN, has fallen as well.
+    ended[~(z - world.support_height(x, y) >= FALL_HEIGHT)] = FELL
     return ended
 
 
