@@ -40,7 +40,7 @@ from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.jobs import run_jobs
 from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Actor, Policy
-from tdgc.sim.commands import CONTINUOUS, NAMES, NUM_COMMANDS, SIDEWAYS, observed_command
+from tdgc.sim.commands import NAMES, NUM_COMMANDS, SIDEWAYS, command_bounds, observed_command
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, action_scale
@@ -90,7 +90,7 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     config = load_low(low)[1]
     rng = np.random.default_rng((_STREAM, seed))
     command = draw_commands(rng, config.commands, np.arange(robots) % len(GAITS))
-    middle = np.array([np.mean(getattr(config.commands, name)) for name in CONTINUOUS[:3]])
+    middle = command_bounds(config.commands)[:3].mean(axis=1)
     command[:, :3] = middle + _MEASURED * (command[:, :3] - middle)
     settle = round(_SETTLE_SECONDS / config.physics.control_dt)
     up, total, steps = np.ones(robots, dtype=bool), np.zeros((robots, 3)), 0
@@ -125,7 +125,7 @@ class ResponseModel:
 
     def __init__(self, given: Array, reached: Array, ranges: CommandRanges, seed: int) -> None:
         self.ranges = ranges
-        bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
+        bounds = command_bounds(ranges)
         width = np.diff(bounds)[:, 0]
         self._zero = np.concatenate([bounds.mean(axis=1), np.full(3, 0.25)])
         self._unit = np.concatenate([0.5 * np.where(width > 0.0, width, 2.0), np.full(3, 0.25)])

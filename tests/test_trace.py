@@ -213,7 +213,7 @@ def test_tilt_and_height_are_errors_of_their_commands(low):
     _, (t,), _ = watch(driver, cell, low[0])
     assert t["error_roll"][1:] == pytest.approx(t["roll"][1:], abs=0.1)
     assert t["error_pitch"][1:] == pytest.approx(t["pitch"][1:], abs=0.1)
-    height = t["base_height"][1:] - low[1].robot.base_height - driver.law.body_height
+    height = t["base_height"][1:] - low[1].robot.base_height - driver.body_height
     assert t["error_body_height"][1:] == pytest.approx(height, abs=0.03)
 
 

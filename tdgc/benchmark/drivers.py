@@ -1,7 +1,7 @@
 """Drivers that decide on commands: the high policy, the paper's scripted baseline, the teacher."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,7 +21,7 @@ from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import observe, width
-from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.tasks.approach import Approach
 from tdgc.tasks.high_observation import SEMANTIC, Seen, high_layout
@@ -63,41 +63,23 @@ class Driver(ABC):
         """Return commands (M, 15) for control step number ``step``, the next one."""
 
 
-@dataclass(frozen=True)
-class GoToGoal:
-    """``gp``, the paper's baseline: a scripted law over the same frozen low policy.
-
-    The robot trots with default behaviour parameters except for swing and body height. Its speed
-    is proportional to the distance, up to a limit, and lower while it faces away from the goal; its
-    yaw rate is proportional to the heading error. It uses no terrain cues. Its
-    settings were tuned on tiles of ``--seed 1`` (docs/experiments.md).
-    """
-
-    top_speed: float = 0.6  # m/s
-    distance_gain: float = 1.0  # 1/s
-    heading_gain: float = 1.5  # 1/s
-    swing_height: float = 0.2  # m
-    body_height: float = 0.04  # m, added to the standing height
-
-    def law(self, position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
-        """Return forward speed and yaw rate for positions (M, 2), headings (M,), goals (M, 2)."""
-        offset = goal - position
-        error = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - yaw)
-        distance = np.linalg.norm(offset, axis=1)
-        return toward(distance, error, self.top_speed, self.distance_gain, self.heading_gain)
-
-
 class BaselineDriver(Driver):
-    """Drives robots by ``GoToGoal``, at every control step, whatever the family.
+    """``gp``, the paper's baseline: a script that drives the same frozen low policy.
 
-    Commands outside ``bounds`` are clipped, because the law has one setting for all low policies.
+    The robot trots towards the goal with default behaviour parameters except for swing and body
+    height, whatever the family; it uses no terrain cues. It decides at every control step. Its
+    settings were tuned on tiles of ``--seed 1`` (docs/experiments.md).
+
+    Commands outside ``bounds`` are clipped, because there is one setting for all low policies.
 
     Args:
         bounds: command ranges that the low policy was trained on; those of ``CommandRanges`` by
             default.
     """
 
-    law = GoToGoal()
+    top_speed = 0.6  # m/s
+    swing_height = 0.2  # m
+    body_height = 0.04  # m, added to the standing height
 
     def __init__(self, bounds: CommandRanges | None = None) -> None:
         self.bounds = bounds or CommandRanges()
@@ -107,12 +89,13 @@ class BaselineDriver(Driver):
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
         self._command = np.tile(default_command(), (loco.num_robots, 1))
-        for name in ("swing_height", "body_height"):
-            self._command[:, INDEX[name]] = getattr(self.law, name)
+        self._command[:, INDEX["swing_height"]] = self.swing_height
+        self._command[:, INDEX["body_height"]] = self.body_height
 
     def command(self, step: int) -> Array:
         state = self._loco.world.state
-        speed, turn = self.law.law(state.position[:, :2], state.yaw, self._goal)
+        distance, direction = to_goal(state, self._goal)
+        speed, turn = toward(distance, wrap_angle(direction - state.yaw), self.top_speed)
         self._command[:, INDEX["vx"]], self._command[:, INDEX["yaw_rate"]] = speed, turn
         low, high = self._decoder.low, self._decoder.high
         return np.clip(self._command, low, high, out=self._command)

@@ -1,6 +1,5 @@
 """Recordings: everything needed to replay an episode, at every control step."""
 
-import dataclasses
 import itertools
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Cell, EpisodeRecord
 from tdgc.config import RobotConfig
+from tdgc.sim.commands import command_bounds
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
@@ -96,7 +96,7 @@ class Recorder:
     def recordings(self) -> list[Recording]:
         """Return the recordings of the last batch watched, in order."""
         cell, loco = self._cell, self._loco
-        bounds = np.array(dataclasses.astuple(self._driver.bounds))
+        bounds = command_bounds(self._driver.bounds)
         result = []
         for k in self._rows:
             steps = self._kept[: self._steps[k]]

@@ -34,7 +34,7 @@ from tdgc.sim.commands import (
 )
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.terrain import TileField
 from tdgc.tasks import rewards
 from tdgc.tasks.high_env import command_share, high_step
@@ -286,7 +286,8 @@ class Tracer:
 
     def _look(self) -> None:
         """Start a new row: the current state, and how the previous decision was carried out."""
-        state, offset = self._loco.world.state, self._goal - self._loco.world.state.position[:, :2]
+        state = self._loco.world.state
+        distance, direction = to_goal(state, self._goal)
         nothing = np.full(self._loco.num_robots, np.nan)
         row: dict[str, NDArray[Any]] = {
             c.name: nothing if c.unit else np.full(len(nothing), None, object) for c in COLUMNS
@@ -296,8 +297,7 @@ class Tracer:
         row["base_z"], row["base_height"] = state.position[:, 2].copy(), self._height()
         row["yaw"] = state.yaw.copy()
         row["pitch"], row["roll"] = tilt(state.gravity)
-        row["goal_distance"] = np.linalg.norm(offset, axis=1)
-        row["goal_bearing"] = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
+        row["goal_distance"], row["goal_bearing"] = distance, wrap_angle(direction - state.yaw)
         row["family"] = np.full(len(nothing), self._driver.told, object)
         if self._count.any():
             self._add_execution(row)

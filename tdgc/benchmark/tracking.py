@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tdgc.config import CommandRanges
 from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy
-from tdgc.sim.commands import CONTINUOUS, INDEX
+from tdgc.sim.commands import CONTINUOUS, INDEX, command_bounds
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
@@ -33,7 +33,7 @@ def draw_commands(
     rng: np.random.Generator, ranges: CommandRanges, gait: NDArray[np.integer]
 ) -> Array:
     """Draw commands (n, 15) with the given gaits (n,), the rest uniform over ``ranges``."""
-    bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
+    bounds = command_bounds(ranges)
     continuous = rng.uniform(bounds[:, 0], bounds[:, 1], (len(gait), len(CONTINUOUS)))
     return np.concatenate([continuous, gait_embedding(gait)], axis=1)
 

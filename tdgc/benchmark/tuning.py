@@ -34,7 +34,7 @@ from tdgc.config import (
     with_overrides,
 )
 from tdgc.policies import Policy
-from tdgc.sim.commands import CONTINUOUS, INDEX
+from tdgc.sim.commands import CONTINUOUS, INDEX, command_bounds
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
@@ -211,7 +211,7 @@ class TunedDriver(HierarchyDriver):
         hold = tuned_decimation(tuning, config, low)
         super().__init__(high, dataclasses.replace(config, decimation=hold))
         self.bounds = tuned_ranges(tuning, config, low)
-        self._bounds = np.array(dataclasses.astuple(self.bounds)).T
+        self._bounds = command_bounds(self.bounds).T
         self._gaits = np.array(sorted(GAITS.index(name) for name in tuning.decoder.gaits))
         self._safety = tuning.safety
 

@@ -35,7 +35,7 @@ from tdgc.sim.robot import (
     HIGHEST_FOOT,
     NUM_JOINTS,
     action_scale,
-    foot_kinematics,
+    nominal_feet,
     nominal_height,
     nominal_pose,
     target_limits,
@@ -149,13 +149,13 @@ class Pose(nn.Module):
         geometry = read_geometry(robot)
         self.thigh, self.calf = geometry.thigh, geometry.calf
         self.lengths = _constant([[geometry.thigh], [geometry.calf]])
-        standing, _ = foot_kinematics(geometry, nominal[None], np.zeros((1, NUM_JOINTS)))
+        standing = nominal_feet(robot, geometry)
         hips = np.pad(geometry.hips, ((0, 0), (0, 1)))
         default = dict(zip(NAMES, default_command(), strict=True))
         self.hips_x, self.hips_y = map(_constant, geometry.hips.T)
         # Feet without the contribution of the commands: relative to the trunk for a pose that
         # walks, because commands pitch and roll the trunk, otherwise relative to their hips.
-        x, y, z = (standing[0] if self.walks else standing[0] - hips).T
+        x, y, z = (standing if self.walks else standing - hips).T
         self.x = _constant(x - 0.5 * default["stance_length"] * FRONT)
         self.y = _constant(y - 0.5 * default["stance_width"] * SIDE)
         lift = nominal_height(robot, geometry) - robot.base_height if self.walks else 0.0

@@ -71,6 +71,11 @@ def observed_command(command: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray((command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT)
 
 
+def command_bounds(ranges: CommandRanges) -> NDArray[np.float64]:
+    """Lower and upper bound of each continuous command, (12, 2)."""
+    return np.array(dataclasses.astuple(ranges), dtype=np.float64)
+
+
 class CommandDecoder:
     """The decoder D from 13 actions to 15 commands, affine with explicit bounds (paper Sec. IV-B).
 
@@ -97,7 +102,7 @@ class CommandDecoder:
             raise ValueError(
                 f"gaits must be some of {', '.join(GAITS)}, each once, not {list(gaits)}"
             )
-        bounds = np.array(dataclasses.astuple(ranges or CommandRanges()), dtype=np.float64)
+        bounds = command_bounds(ranges or CommandRanges())
         self.low = np.concatenate([bounds[:, 0], np.zeros(3)])
         self.high = np.concatenate([bounds[:, 1], np.full(3, 0.5)])
         self.action_limit = action_limit

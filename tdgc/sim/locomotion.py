@@ -21,8 +21,8 @@ from tdgc.sim.robot import (
     NUM_JOINTS,
     Array,
     commanded_pose,
-    foot_kinematics,
     joint_targets,
+    nominal_feet,
     nominal_height,
     nominal_pose,
     to_world,
@@ -121,8 +121,7 @@ class Locomotion:
         self.payload = np.zeros(num_robots)
         self.armature = np.zeros(num_robots)
         geometry = self.world.state.geometry
-        # Feet in the nominal pose, (1, 4, 3) m.
-        self._feet, _ = foot_kinematics(geometry, self.nominal[None], np.zeros((1, NUM_JOINTS)))
+        self._feet = nominal_feet(robot, geometry)
         self._stand = nominal_height(robot, geometry)
         self._pose = self._pose_of = np.empty(0)  # cached ``pose`` and what it was computed from
 

@@ -31,10 +31,14 @@ def nominal_pose(config: RobotConfig) -> Array:
     return np.stack([config.nominal_hip * SIDE, thigh, np.full(4, config.nominal_calf)], 1).ravel()
 
 
+def nominal_feet(config: RobotConfig, geometry: Geometry) -> Array:
+    """Feet of the nominal pose in the trunk's frame, (4, 3) m."""
+    return foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))[0][0]
+
+
 def nominal_height(config: RobotConfig, geometry: Geometry) -> float:
     """Height of the trunk above the soles in the nominal pose, m."""
-    feet, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
-    return float(geometry.foot_radius - feet[0, :, 2].min())
+    return float(geometry.foot_radius - nominal_feet(config, geometry)[:, 2].min())
 
 
 def check_nominal_pose(config: RobotConfig, geometry: Geometry) -> None:
@@ -85,6 +89,15 @@ def fitted(config: RobotConfig) -> dict[str, Any]:
     return found
 
 
+def _stance(config: RobotConfig, geometry: Geometry, change: Array) -> Array:
+    """Nominal feet, moved apart as the commands differ from their defaults, by ``change`` (M, 15):
+    (M, 4, 3) m."""
+    feet = np.tile(nominal_feet(config, geometry), (len(change), 1, 1))
+    feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * FRONT
+    feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * SIDE
+    return feet
+
+
 def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swing: Array) -> Array:
     """q0(c, phi): the nominal pose adapted to the commands, (M, 15), (M, 4) -> (M, 12) rad.
 
@@ -97,11 +110,8 @@ def commanded_pose(config: RobotConfig, geometry: Geometry, command: Array, swin
     reach gets the nearest angles within the calf's limits, and no foot is higher than
     ``HIGHEST_FOOT``.
     """
-    standing, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
     change = command - default_command()
-    feet = np.repeat(standing, len(command), axis=0)
-    feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * FRONT
-    feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * SIDE
+    feet = _stance(config, geometry, change)
     feet[..., 2] -= change[:, INDEX["body_height"], None]
     feet[..., 2] += change[:, INDEX["swing_height"], None] * swing
     feet[..., 2] = np.minimum(feet[..., 2], HIGHEST_FOOT)
@@ -148,11 +158,8 @@ def walking_pose(
         ahead: (M, 4) the phases later by the joints' lag, for the feet's positions.
         grown: (M,) share of swing height and travel, which ramps up as a gait begins.
     """
-    standing, _ = foot_kinematics(geometry, nominal_pose(config)[None], np.zeros((1, NUM_JOINTS)))
     change = command - default_command()
-    feet = np.repeat(standing, len(command), axis=0)
-    feet[..., 0] += 0.5 * change[:, INDEX["stance_length"], None] * FRONT
-    feet[..., 1] += 0.5 * change[:, INDEX["stance_width"], None] * SIDE
+    feet = _stance(config, geometry, change)
     feet[..., :2] += grown[:, None, None] * foot_travel(command, ahead, feet[..., :2])
     # The unloaded nominal pose is higher than the robot stands.
     lift = nominal_height(config, geometry) - config.base_height
@@ -304,6 +311,13 @@ def quaternion_product(one: Array, other: Array) -> Array:
         ],
         axis=-1,
     )
+
+
+def to_goal(state: "RobotState", goal: Array) -> tuple[Array, Array]:
+    """Horizontal distance from the trunks to ``goal`` (M, 2) m, (M,) m, and its direction in the
+    world, (M,) rad."""
+    offset = goal - state.position[:, :2]
+    return np.linalg.norm(offset, axis=1), np.arctan2(offset[:, 1], offset[:, 0])
 
 
 def to_world(xy: Array, yaw: Array, points: Array) -> tuple[Array, Array]:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array
+from tdgc.sim.robot import Array, to_goal
 
 
 class Approach:
@@ -33,5 +33,4 @@ class Approach:
         self.speed[:], self.distance[:] = (self.distance - now) / self._seconds, now
 
     def _measure(self, goal: Array) -> Array:
-        position = self._loco.world.state.position[:, :2]
-        return np.asarray(np.linalg.norm(goal - position, axis=1))
+        return to_goal(self._loco.world.state, goal)[0]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import LowLevelConfig
-from tdgc.sim.commands import CONTINUOUS, INDEX, gait_index
+from tdgc.sim.commands import CONTINUOUS, INDEX, command_bounds, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.robot import Array
 from tdgc.tasks.leaps import LONGEST
@@ -36,8 +36,7 @@ class CommandDraw:
 
     def __init__(self, config: LowLevelConfig, rng: np.random.Generator, training: bool) -> None:
         self._config, self._rng, self._training = config, rng, training
-        bounds = [getattr(config.commands, name) for name in CONTINUOUS]
-        self._low, self._high = np.array(bounds).T
+        self._low, self._high = command_bounds(config.commands).T
         self.share = np.full(len(GAITS), config.command_start if training else 1.0)
         self.scores = np.zeros((len(GAITS), 4))
         self.falls = np.full((_FALLS, 1 + len(CONTINUOUS)), -1.0)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import LowLevelConfig
-from tdgc.sim.commands import CONTINUOUS, INDEX
+from tdgc.sim.commands import INDEX, command_bounds
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.terrain import MAX_LEVEL, TILE_SIZE, TileField
 from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.episodes import Episodes
@@ -63,7 +63,7 @@ class Crossings:
     ) -> None:
         self._config, self._episodes, self._rng = config.crossing, episodes, rng
         self._levels = config.levels
-        self._low, self._high = np.array([getattr(config.commands, n) for n in CONTINUOUS]).T
+        self._low, self._high = command_bounds(config.commands).T
         self.flat = np.array([family == FLAT for family in families])
         self.leapers = np.array([family == "gap" for family in families])
         self._plan = LeapPlan(len(families), config.commands, _CLEAR)
@@ -152,9 +152,8 @@ class Crossings:
         rows = np.flatnonzero(e.crossing)
         if not rows.size:
             return
-        offset = e.waypoint - state.position[:, :2]
-        e.reached |= e.crossing & (np.linalg.norm(offset, axis=1) < GOAL_RADIUS)
-        bearing = np.arctan2(offset[:, 1], offset[:, 0])
+        distance, bearing = to_goal(state, e.waypoint)
+        e.reached |= e.crossing & (distance < GOAL_RADIUS)
         direction = bearing - state.yaw
         velocity = e.speed[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
         velocity = within(velocity, self._low[:2], self._high[:2])

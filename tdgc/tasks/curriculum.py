@@ -16,10 +16,12 @@ the text's version reacts within one episode, Algorithm 1 within W. At the top (
 further promotion (or demotion) changes nothing, so there, too, the window keeps sliding.
 """
 
-from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from tdgc.state import State, copies, fill
 
 Ints = NDArray[np.int64]
 
@@ -89,75 +91,40 @@ class Curriculum:
         self.outcomes: NDArray[np.bool_] = np.zeros((n, window), dtype=bool)
         self.counts: Ints = np.zeros(n, dtype=np.int64)
 
-    def push(self, envs: ArrayLike, successes: ArrayLike) -> Ints:
-        """Record one finished episode for each given environment and update its level.
+    def push(self, envs: Ints, successes: NDArray[np.bool_]) -> None:
+        """Record one finished episode for each of the environments ``envs`` (k,), which are
+        distinct, and update their levels; ``successes`` (k,).
 
         The order is that of Algorithm 1: push the outcome; if the window is full, count and
         update the level; if the level changed, clear the window.
-
-        Args:
-            envs: the environments: k distinct indices, or a mask (n,) with k True entries.
-            successes: (k,) of bool, in the order of ``envs``.
-
-        Returns:
-            The change of level, (k,): -1, 0 or 1.
-
-        Raises:
-            ValueError: a duplicate or out-of-range index, or shapes that do not match.
         """
-        who = np.asarray(envs)
-        if who.dtype == bool:
-            if who.shape != self.levels.shape:
-                raise ValueError(f"the mask has shape {who.shape}, not {self.levels.shape}")
-            who = np.flatnonzero(who)
-        who = who.astype(np.int64)  # an empty list becomes a float array
-        success = np.asarray(successes, dtype=bool)
-        if who.ndim != 1 or success.shape != who.shape:
-            raise ValueError(f"{who.shape} environments but {success.shape} successes")
-        if len(who) and not (0 <= who.min() and who.max() < len(self.levels)):
-            raise ValueError(f"environments must be in 0..{len(self.levels) - 1}, not {who}")
-        if len(np.unique(who)) != len(who):
-            raise ValueError(f"an environment ends one episode at a time, not {who}")
-
-        self.outcomes[who] = np.column_stack((self.outcomes[who, 1:], success))
-        self.counts[who] = np.minimum(self.counts[who] + 1, self.window)
-
-        before = self.levels[who]
-        after = update_level(
-            before, self.outcomes[who].sum(axis=1), self.window, self.threshold, self.max_level
+        self.outcomes[envs] = np.column_stack((self.outcomes[envs, 1:], successes))
+        self.counts[envs] = np.minimum(self.counts[envs] + 1, self.window)
+        full = envs[self.counts[envs] == self.window]
+        level = update_level(
+            self.levels[full],
+            self.outcomes[full].sum(axis=1),
+            self.window,
+            self.threshold,
+            self.max_level,
         )
-        change = np.where(self.counts[who] == self.window, after - before, 0)
-        self.levels[who] += change
-        moved = who[change != 0]
-        self.outcomes[moved] = False
-        self.counts[moved] = 0
-        return change
+        moved = full[level != self.levels[full]]
+        self.levels[full] = level
+        self.outcomes[moved], self.counts[moved] = False, 0
 
-    def state_dict(self) -> dict[str, NDArray[np.generic]]:
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {"levels": self.levels, "outcomes": self.outcomes, "counts": self.counts}
+
+    def state_dict(self) -> State:
         """Copies of everything that ``push`` changes, for an exact resume."""
-        return {
-            "levels": self.levels.copy(),
-            "outcomes": self.outcomes.copy(),
-            "counts": self.counts.copy(),
-        }
+        return copies(self._arrays())
 
-    def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Resume from the ``state_dict`` of a curriculum with the same sizes and rules.
 
         Raises:
-            ValueError: wrong keys or shapes, or a level or count out of range; the curriculum is
-                then left unchanged.
+            ValueError: an array is missing or has another shape, or a level is out of range.
         """
-        mine = self.state_dict()
-        if set(state) != set(mine):
-            raise ValueError(f"keys {sorted(state)}, not {sorted(mine)}")
-        loaded = {name: np.array(state[name], dtype=mine[name].dtype) for name in mine}
-        for name, array in loaded.items():
-            if array.shape != mine[name].shape:
-                raise ValueError(f"'{name}' has shape {array.shape}, not {mine[name].shape}")
-        for name, limit in (("levels", self.max_level - 1), ("counts", self.window)):
-            if np.any((loaded[name] < 0) | (loaded[name] > limit)):
-                raise ValueError(f"'{name}' must be in 0..{limit}")
-        self.levels = loaded["levels"]
-        self.outcomes = loaded["outcomes"]
-        self.counts = loaded["counts"]
+        fill(self._arrays(), state)
+        if np.any(self.levels >= self.max_level):
+            raise ValueError(f"'levels' must be in 0..{self.max_level - 1}")

@@ -17,7 +17,7 @@ from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, default_command, gait
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import observe
-from tdgc.sim.robot import Array
+from tdgc.sim.robot import Array, to_goal
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import draw_start_goal
 from tdgc.state import State, copies, fill
@@ -64,11 +64,11 @@ def high_step(
         config: weights and constants.
     """
     state = loco.world.state
-    offset = goal - state.position[:, :2]
+    distance, direction = to_goal(state, goal)
     x, y = state.position[:, 0], state.position[:, 1]
     return rewards.HighStep(
-        distance=np.linalg.norm(offset, axis=1),
-        heading_error=np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw,
+        distance=distance,
+        heading_error=direction - state.yaw,
         time_share=np.broadcast_to(time_share, x.shape),
         lin_vel=state.lin_vel,
         ang_vel=state.ang_vel,

@@ -12,7 +12,7 @@ from tdgc.policies import Mirror
 from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS
 from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
 from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, columns, in_place, mirror, width
-from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.terrain import FAMILIES
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP
@@ -60,9 +60,8 @@ class Seen(NamedTuple):
 
 def _goal(seen: Seen) -> Array:
     state = seen.loco.world.state
-    offset = seen.goal - state.position[:, :2]
-    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - state.yaw)
-    distance = np.linalg.norm(offset, axis=1)
+    distance, direction = to_goal(state, seen.goal)
+    bearing = wrap_angle(direction - state.yaw)
     return np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1)
 
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import CommandRanges, TeacherConfig
-from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
+from tdgc.sim.commands import CONTINUOUS, INDEX, command_bounds, default_command
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
 from tdgc.tasks.leaps import (
     BEYOND,
@@ -119,12 +119,13 @@ _APART = 0.9  # rad, least angle between two ways whose mean would lead into the
 WAY = [INDEX[name] for name in ("vx", "vy", "yaw_rate")]
 
 
+_DISTANCE_GAIN, _HEADING_GAIN = 1.0, 1.5  # 1/s
+
+
 def toward(
     distance: Array,
     error: Array,
     top_speed: Array | float,
-    distance_gain: float = 1.0,
-    heading_gain: float = 1.5,
     turns: tuple[float, float] = CommandRanges().yaw_rate,
 ) -> tuple[Array, Array]:
     """Forward speed in m/s and yaw rate in rad/s towards a point, (M,) each.
@@ -135,11 +136,10 @@ def toward(
     Args:
         distance, error: (M,) m to the point, and (M,) rad, its bearing relative to the heading.
         top_speed: m/s, (M,) or a scalar.
-        distance_gain, heading_gain: 1/s.
         turns: rad/s, lowest and highest yaw rate.
     """
-    speed = np.minimum(top_speed, distance_gain * distance)
-    turn = np.clip(heading_gain * error, *turns)
+    speed = np.minimum(top_speed, _DISTANCE_GAIN * distance)
+    turn = np.clip(_HEADING_GAIN * error, *turns)
     return speed * np.maximum(np.cos(error), 0.0), turn
 
 
@@ -168,7 +168,7 @@ class Teacher:
         self._origin = field.origin(np.arange(m), 0)
         commands = np.array([style.command() for style in (skill.uneven, SLOPING, LEAPING)])
         # The low policy may have been trained on narrower ranges than the styles use.
-        bounds = np.array([getattr(ranges, name) for name in CONTINUOUS])
+        bounds = command_bounds(ranges)
         behaviour = commands[:, : len(CONTINUOUS)]
         np.clip(behaviour, bounds[:, 0], bounds[:, 1], out=behaviour)
         self._uneven, self._sloping, self._leap = commands
@@ -216,9 +216,7 @@ class Teacher:
     def commands(self, loco: Locomotion, goal: Array) -> Array:
         """Commands (M, 15) for the coming decision; ``goal`` (M, 2) m in the world."""
         state = loco.world.state
-        offset = goal - state.position[:, :2]
-        distance = np.linalg.norm(offset, axis=1)
-        bearing = np.arctan2(offset[:, 1], offset[:, 0])
+        distance, bearing = to_goal(state, goal)
         local = state.position[:, :2] - self._origin
         second = bearing.copy()
         self.dearer[:] = 0.0
