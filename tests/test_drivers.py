@@ -33,7 +33,7 @@ from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import Array
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
-from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, Seen, high_layout
+from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, HighSources, high_layout
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
@@ -254,7 +254,7 @@ def test_mixed_terrain_is_unknown_to_the_high_level(low, tmp_path):
             zero, families = np.zeros((1, NUM_ACTIONS)), np.array([index])
             probes = height_probes(loco, PROBES[HighLevelConfig().probes])
             nothing = np.zeros(1)
-            seen = Seen(loco, goal, nothing, zero, families, probes, nothing, nothing)
+            seen = HighSources(loco, goal, nothing, zero, families, probes, nothing, nothing)
             action, _ = high.predict(observe(high_layout(config), seen))
             return CommandDecoder(config.commands).decode(action)
 

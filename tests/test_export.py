@@ -33,7 +33,7 @@ from tdgc.sim.observation import observe, width
 from tdgc.sim.robot import JOINTS, nominal_pose
 from tdgc.sim.urdf import urdf_path
 from tdgc.tasks.high_env import NavigationTask
-from tdgc.tasks.high_observation import Seen, high_layout, high_mirror
+from tdgc.tasks.high_observation import HighSources, high_layout, high_mirror
 from tdgc.tasks.low_observation import low_mirror
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
@@ -259,7 +259,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(
         closing = (np.linalg.norm(before, axis=1) - distance) / 0.08 * (np.arange(5) > 0)
         seen = observe(
             high_layout(config),
-            Seen(
+            HighSources(
                 loco, task.goal, elapsed / task.horizon, task.decoder.normalise(last),
                 task.family_index, heights, late, closing,
             ),

@@ -144,7 +144,7 @@ def test_sees_how_fast_the_goal_comes_nearer(task):
     assert (task.observe()[:, column] == 0.0).all()
     world, away = task.locomotion.world, task.goal - task.locomotion.world.state.position[:, :2]
     world.state.position[:, :2] += 0.12 * away / np.linalg.norm(away, axis=1)[:, None]
-    task._approach.measure(task.goal)
+    task._observer.measure(task.goal)
     assert task.observe()[:, column] == pytest.approx(np.full(5, 1.2), abs=1e-6)
     task.reset(np.array([1, 3]))
     assert (task.observe()[:, column] != 0.0).tolist() == [True, False, True, False, True]
@@ -176,7 +176,7 @@ def test_mirrored_robots_see_mirrored_things(cues):
     state.derive()
     task._actions[0] = rng.uniform(-1.0, 1.0, 13)
     task._actions[0, 1] *= mirror.action_sign
-    task._probes.begin(np.arange(2))
+    task._observer.begin(np.arange(2), task.goal)
     seen, other = task.observe()
     np.testing.assert_allclose(
         other, seen[list(mirror.obs_index)] * np.float32(mirror.obs_sign), atol=2e-5
@@ -255,7 +255,7 @@ def test_probes_see_what_is_ahead(task):
     task.field.heights[int(np.ceil(x / 0.05)) : 2 * n] = 0.3
     xy = state.position[:, :2].copy()
     task.locomotion.place(np.arange(5), xy, np.zeros(5), np.zeros(5))
-    task._probes.begin(np.arange(5))
+    task._observer.begin(np.arange(5), task.goal)
     probes = task.observe()[1, columns(high_layout(CONFIG))["probes"]] * 0.5
     standing = state.position[1, 2] - 0.30
     assert probes[row] == pytest.approx(0.3 - standing, abs=1e-6)

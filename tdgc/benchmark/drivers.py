@@ -20,13 +20,11 @@ from tdgc.config import (
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.observation import observe, width
+from tdgc.sim.observation import width
 from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.sensors import Noise
-from tdgc.tasks.approach import Approach
-from tdgc.tasks.high_observation import SEMANTIC, Seen, high_layout
+from tdgc.tasks.high_observation import SEMANTIC, HighObserver, high_layout
 from tdgc.tasks.pairing import paired
-from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.teacher import Skill, Teacher, toward
 
 
@@ -167,9 +165,8 @@ class HierarchyDriver(Driver):
         self._families = np.full(m, seen)
         if config.cues in ("both", "semantic"):
             self.told = SEMANTIC[seen]
-        self._sensor = HeightProbes(loco, PROBES[config.probes], noise)
+        self._observer = HighObserver(loco, config, noise)
         seconds = config.decimation * loco.physics.control_dt
-        self._approach = Approach(loco, seconds)
         self._horizon = round(config.episode_seconds / seconds)
         self._state: Any = None
         self._last = np.zeros((m, NUM_ACTIONS))
@@ -187,26 +184,13 @@ class HierarchyDriver(Driver):
         """Return o^H, as in training."""
         rows = np.arange(self._loco.num_robots)
         if decision == 0:
-            self._sensor.begin(rows)
-            self._approach.begin(rows, self._goal)
+            self._observer.begin(rows, self._goal)
         else:
-            self._sensor.measure()
-            self._approach.measure(self._goal)
-        probes = self._sensor.read()
+            self._observer.measure(self._goal)
         if self.config.cues in ("both", "geometric"):
-            self.probes = probes
+            self.probes = self._observer.probes.read()
         share = np.full(len(rows), decision / self._horizon)
-        seen = Seen(
-            self._loco,
-            self._goal,
-            share,
-            self._last,
-            self._families,
-            probes,
-            self._sensor.late,
-            self._approach.speed,
-        )
-        return observe(high_layout(self.config), seen)
+        return self._observer.observe(self._goal, share, self._last, self._families)
 
 
 def load_high(

@@ -16,18 +16,15 @@ from tdgc.policies import Policy
 from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, default_command, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.observation import observe
 from tdgc.sim.robot import Array, to_goal
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import draw_start_goal
 from tdgc.state import State, copies, fill
 from tdgc.tasks import rewards
-from tdgc.tasks.approach import Approach
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, Seen, high_layout, high_spaces
+from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, HighObserver, high_spaces
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
-from tdgc.tasks.probes import PROBES, HeightProbes
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, has_failed, outcome
 from tdgc.tasks.statistics import Sums
@@ -167,8 +164,7 @@ class NavigationTask:
         noise = Noise(self.config.randomisation, self.rng) if self.training else None
         self.locomotion = Locomotion(m, c.robot, c.physics, self.field, c.gyro, self._visual)
         self._executor = Executor(self.locomotion, self.low, noise)
-        self._probes = HeightProbes(self.locomotion, PROBES[self.config.probes], noise)
-        self._approach = Approach(self.locomotion, self.step_seconds)
+        self._observer = HighObserver(self.locomotion, self.config, noise)
 
     # ------------------------------------------------------------------ episodes
 
@@ -196,8 +192,7 @@ class NavigationTask:
         self.locomotion.place(
             index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
         )
-        self._probes.begin(index)
-        self._approach.begin(index, self.goal)
+        self._observer.begin(index, self.goal)
         if self.teacher is not None:
             self.teacher.begin(index, self.goal, self._expects())
             share = 1.0 - self._decisions[0] / self._lead if self._lead else 0.0
@@ -246,8 +241,7 @@ class NavigationTask:
             state = loco.world.state
             now = np.column_stack([state.trunk_force, state.leg_force])
             np.maximum(force, now, out=force)
-        self._probes.measure()
-        self._approach.measure(self.goal)
+        self._observer.measure(self.goal)
         if self.teacher is not None:
             self.teacher.watch(loco, self.step_seconds)
         self.elapsed += 1
@@ -277,18 +271,8 @@ class NavigationTask:
 
     def observe(self) -> NDArray[np.float32]:
         """o^H, (M, n), followed by the guidance, (M, ``GUIDANCE``), if there is a teacher."""
-        seen = observe(
-            high_layout(self.config),
-            Seen(
-                self.locomotion,
-                self.goal,
-                self.elapsed / self.horizon,
-                self._actions[0],
-                self.family_index,
-                self._probes.read(),
-                self._probes.late,
-                self._approach.speed,
-            ),
+        seen = self._observer.observe(
+            self.goal, self.elapsed / self.horizon, self._actions[0], self.family_index
         )
         if self.teacher is None:
             return seen
@@ -344,9 +328,8 @@ class NavigationTask:
                 add(f"family/{family}/{name}", (gait[mine] == g).sum())
 
     def take_stats(self) -> dict[str, float]:
-        """Return and restart the sums; Bullet's time is a running total."""
+        """Return and restart the sums."""
         stats, self.stats = self.stats, Sums()
-        stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
         return stats
 
     def forget(self) -> None:
@@ -356,21 +339,21 @@ class NavigationTask:
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """State of the episodes under way, not copied."""
         taught = {} if self.teacher is None else {"speed": self.teacher.speed}
-        return taught | {
-            "goal": self.goal,
-            "elapsed": self.elapsed,
-            "reached_at": self._reached_at,
-            "next_push": self._next_push,
-            "actions": self._actions,
-            "commands": self._commands,
-            "led": self._led,
-            "untold": self._untold,
-            "probes": self._probes.measured,
-            "late": self._probes.late,
-            "goal_distance": self._approach.distance,
-            "closing_speed": self._approach.speed,
-            "taught": self._taught,
-        }
+        return (
+            taught
+            | self._observer.arrays()
+            | {
+                "goal": self.goal,
+                "elapsed": self.elapsed,
+                "reached_at": self._reached_at,
+                "next_push": self._next_push,
+                "actions": self._actions,
+                "commands": self._commands,
+                "led": self._led,
+                "untold": self._untold,
+                "taught": self._taught,
+            }
+        )
 
     def state_dict(self) -> State:
         """The curriculum, the random generator and the ``episodes`` under way, as copies."""

@@ -11,11 +11,23 @@ from tdgc.config import CommandRanges, ConfigError, HighLevelConfig
 from tdgc.policies import Mirror
 from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS
 from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
-from tdgc.sim.observation import ARROW, JOINTS, LEGS, Flip, Term, columns, in_place, mirror, width
+from tdgc.sim.observation import (
+    ARROW,
+    JOINTS,
+    LEGS,
+    Flip,
+    Term,
+    columns,
+    in_place,
+    mirror,
+    observe,
+    width,
+)
 from tdgc.sim.robot import Array, to_goal, wrap_angle
+from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import FAMILIES
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
-from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP
+from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP, PROBES, HeightProbes
 from tdgc.tasks.teacher import WAY
 
 GOAL_SCALE = 1.0 / 8.0  # 1/m: scales distances to shares of the tile's length
@@ -34,7 +46,7 @@ GUIDANCE = sum(GUIDANCE_PARTS.values())
 SEMANTIC = (*FAMILIES, "unknown")
 
 
-class Seen(NamedTuple):
+class HighSources(NamedTuple):
     """The sources of o^H for M robots.
 
     Attributes:
@@ -58,21 +70,21 @@ class Seen(NamedTuple):
     closing: Array
 
 
-def _goal(seen: Seen) -> Array:
+def _goal(seen: HighSources) -> Array:
     state = seen.loco.world.state
     distance, direction = to_goal(state, seen.goal)
     bearing = wrap_angle(direction - state.yaw)
     return np.stack([GOAL_SCALE * distance, np.cos(bearing), np.sin(bearing)], axis=1)
 
 
-def _joint_error(seen: Seen) -> Array:
+def _joint_error(seen: HighSources) -> Array:
     return seen.loco.world.state.q - seen.loco.joint_offset - seen.loco.nominal
 
 
 _FLIP_ACTION = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in (*CONTINUOUS, "gait")))
 _PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
 #: All terms of o^H, in order.
-_TERMS: tuple[Term[Seen], ...] = (
+_TERMS: tuple[Term[HighSources], ...] = (
     Term("goal", 3, _goal, mirror=in_place(1.0, 1.0, -1.0)),
     Term("time_left", 1, lambda s: 1.0 - s.time_share[:, None]),
     Term("gravity", 3, lambda s: s.loco.world.state.gravity, mirror=ARROW),
@@ -88,7 +100,7 @@ _TERMS: tuple[Term[Seen], ...] = (
 )
 
 
-def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
+def high_layout(config: HighLevelConfig) -> tuple[Term[HighSources], ...]:
     """The terms of the high policy's observation o^H, in order."""
     geometric = config.cues in ("both", "geometric")
     optional = {
@@ -99,6 +111,58 @@ def high_layout(config: HighLevelConfig) -> tuple[Term[Seen], ...]:
         "closing_speed": config.closing_speed,
     }
     return tuple(term for term in _TERMS if optional.get(term.name, True))
+
+
+class HighObserver:
+    """Observes o^H of M robots from one decision to the next, in training as in evaluation.
+
+    Args:
+        loco: the robots.
+        config: the MDP.
+        noise: of the height probes; None for exact ones.
+
+    Attributes:
+        probes: the height probes.
+        distance: (M,) m to the goal at the latest decision.
+        closing: (M,) m/s towards the goal since the decision before; 0 at the start of an episode.
+    """
+
+    def __init__(self, loco: Locomotion, config: HighLevelConfig, noise: Noise | None) -> None:
+        self._loco, self._layout = loco, high_layout(config)
+        self._seconds = config.decimation * loco.physics.control_dt
+        self.probes = HeightProbes(loco, PROBES[config.probes], noise)
+        self.distance, self.closing = np.zeros((2, loco.num_robots))
+
+    def begin(self, index: NDArray[np.integer], goal: Array) -> None:
+        """Start new episodes for the robots ``index`` (n,); ``goal`` (M, 2) m in the world."""
+        self.probes.begin(index)
+        distance, _ = to_goal(self._loco.world.state, goal)
+        self.distance[index], self.closing[index] = distance[index], 0.0
+
+    def measure(self, goal: Array) -> None:
+        """Measure ground and approach, once per decision after the first."""
+        self.probes.measure()
+        now, _ = to_goal(self._loco.world.state, goal)
+        self.closing[:], self.distance[:] = (self.distance - now) / self._seconds, now
+
+    def observe(
+        self, goal: Array, time_share: Array, last_action: Array, families: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """o^H, (M, n); the arguments are those of ``HighSources``."""
+        heights, late = self.probes.read(), self.probes.late
+        sources = HighSources(
+            self._loco, goal, time_share, last_action, families, heights, late, self.closing
+        )
+        return observe(self._layout, sources)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """State of the episodes under way, not copied."""
+        return {
+            "probes": self.probes.measured,
+            "late": self.probes.late,
+            "goal_distance": self.distance,
+            "closing_speed": self.closing,
+        }
 
 
 def untold_column(config: HighLevelConfig) -> int | None:

@@ -28,7 +28,7 @@ from tdgc.tasks.crossings import Crossings
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.leaps import Landing
-from tdgc.tasks.low_observation import CRITIC_LAYOUT, Seen, low_spaces
+from tdgc.tasks.low_observation import CRITIC_LAYOUT, CriticSources, low_spaces
 from tdgc.tasks.low_statistics import by_gait
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import is_fallen
@@ -264,7 +264,7 @@ class LowLevelTask:
     def observe(self) -> NDArray[np.float32]:
         """Observations (M, n): the actor's part, noisy in training, then the critic's."""
         actor = self.locomotion.observe(self._noise)
-        critic = observe(CRITIC_LAYOUT, Seen(self.locomotion, self.ground))
+        critic = observe(CRITIC_LAYOUT, CriticSources(self.locomotion, self.ground))
         return np.concatenate([actor, critic], axis=1)
 
     # ------------------------------------------------------------------ statistics, resume

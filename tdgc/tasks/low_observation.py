@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from tdgc.policies import Mirror
 
 
-class Seen(NamedTuple):
+class CriticSources(NamedTuple):
     """The sources of the critic's own terms."""
 
     loco: Locomotion
     ground: Ground
 
 
-def _dynamics(seen: Seen) -> Array:
+def _dynamics(seen: CriticSources) -> Array:
     """The randomised dynamics, (M, 6), each scaled to be of order one."""
     loco, world = seen.loco, seen.loco.world
     return np.stack(
@@ -42,7 +42,7 @@ def _dynamics(seen: Seen) -> Array:
 _PROBE_SWAP = tuple(3 * (i // 3) + 2 - i % 3 for i in range(len(GROUND_PROBES)))
 _PROBES = Flip(_PROBE_SWAP, (1.0,) * len(GROUND_PROBES))
 #: The critic's own part of the observation, which the actor never sees.
-CRITIC_LAYOUT: tuple[Term[Seen], ...] = (
+CRITIC_LAYOUT: tuple[Term[CriticSources], ...] = (
     Term("velocity", 3, lambda s: s.loco.world.state.heading_vel, 2.0, mirror=ARROW),
     Term("angular_velocity", 3, lambda s: s.loco.world.state.body_rate, GYRO_SCALE, mirror=TURN),
     Term("base_height", 1, lambda s: (s.ground.base - s.loco.robot.base_height)[:, None], 10.0),
