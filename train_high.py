@@ -41,11 +41,9 @@ from tdgc.policies.files import header_file
 from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
-from tdgc.sim.geometry import read_geometry
-from tdgc.sim.locomotion import check_randomisation
+from tdgc.sim.locomotion import check_robot
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EDITION, may_have_trenches
-from tdgc.sim.world import check_robot
 from tdgc.tasks.curriculum import check_rules
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
@@ -342,9 +340,7 @@ def main(arguments: list[str] | None = None) -> int:
         low, low_config = load_low(cast(str, config.low))
         config = pin_low(config)
         tqdm.write(f"low policy: {config.low}")
-        check_robot(low_config.robot, low_config.physics)
-        trunk = read_geometry(low_config.robot).trunk_mass
-        check_randomisation(config.env.randomisation, low_config.physics, trunk)
+        check_robot(low_config.robot, low_config.physics, config.env.randomisation)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check(config)
         interruption = Interruption(args.time_limit)

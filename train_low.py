@@ -36,12 +36,10 @@ from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.show import plots
-from tdgc.sim.geometry import read_geometry
-from tdgc.sim.locomotion import actor_layout, check_randomisation
+from tdgc.sim.locomotion import actor_layout, check_robot
 from tdgc.sim.observation import width
 from tdgc.sim.robot import fitted
 from tdgc.sim.terrain import EDITION
-from tdgc.sim.world import check_robot
 from tdgc.tasks.low_env import make_task
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 from tdgc.tasks.low_statistics import summarise
@@ -83,9 +81,7 @@ def check(config: LowTrainConfig) -> None:
         )
     check_families(config.env.families)
     check_levels(config.env.levels)
-    check_robot(config.env.robot, config.env.physics)
-    trunk = read_geometry(config.env.robot).trunk_mass
-    check_randomisation(config.env.randomisation, config.env.physics, trunk)
+    check_robot(config.env.robot, config.env.physics, config.env.randomisation)
 
 
 def fit(config: LowTrainConfig, assignments: Sequence[str]) -> LowTrainConfig:

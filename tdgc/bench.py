@@ -44,6 +44,7 @@ from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS
+from tdgc.sim.terrain import FAMILIES
 from tdgc.tasks.high_observation import high_spaces
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import low_mirror, low_spaces
@@ -239,12 +240,11 @@ def collected(name: str, workers: int, row: dict[str, float]) -> None:
 
 def compare_grounds(robots: int, workers: int, seconds: float) -> dict[str, Any]:
     """Content of bench.json: ground -> workers, "1" or "all" -> ``measure``."""
-    families = ("rough", "pillar", "stair", "gap", "tilt")
     result: dict[str, dict[str, dict[str, float]]] = {"plane": {}, "terrain": {}}
     head("ground", *_COLUMNS)
     for ground, rows in result.items():
         terrain: Literal["plane", "tiles"] = "plane" if ground == "plane" else "tiles"
-        config = LowLevelConfig(terrain=terrain, families=families)
+        config = LowLevelConfig(terrain=terrain, families=FAMILIES)
         for name, number in (("1", 1), ("all", workers)):
             rows[name] = measure(config, robots, number, seconds)
             collected(ground, number, rows[name])

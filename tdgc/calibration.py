@@ -15,6 +15,7 @@ import copy
 import dataclasses
 import functools
 import itertools
+import operator
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -344,9 +345,12 @@ def calibrate(
     config = load_low(low)[1]
     robots, turns = calibration.robots, calibration.turns
     counts = [min(_BATCH, robots - first) for first in range(0, robots, _BATCH)]
-    jobs = [(count, seed * len(counts) + k) for k, count in enumerate(counts)]
+    jobs = [
+        functools.partial(measure, low, count, seed * len(counts) + k)
+        for k, count in enumerate(counts)
+    ]
     walks = []
-    for walk in run_jobs(functools.partial(_walk, low), jobs, workers):
+    for walk in run_jobs(operator.call, jobs, workers):
         walks.append(walk)
         tick(_WALKING * len(walks) / len(jobs))
     given, reached = (np.concatenate(parts) for parts in zip(*walks, strict=True))
@@ -372,10 +376,6 @@ def calibrate(
         "error_vx_m_s": vx, "error_vy_m_s": vy, "error_yaw_rate_rad_s": yaw_rate,
         "action_difference_before": first, "action_difference_after": last,
     }  # fmt: skip
-
-
-def _walk(low: Policy, job: tuple[int, int]) -> tuple[Array, Array]:
-    return measure(low, *job)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -269,16 +269,21 @@ def _write_graph(graph: LowGraph | HighGraph, path: Path) -> None:
             traced = th.jit.trace(graph, example)  # type: ignore[no-untyped-call]
             th.jit.save(traced, path)
             return
-        th.onnx.export(
+        program = th.onnx.export(
             graph,
             example,
-            path,
             input_names=[s.name for s in graph.inputs],
             output_names=[s.name for s in graph.outputs],
-            external_data=False,
             dynamo=True,
             verbose=False,
         )
+    assert program is not None
+    model = program.model_proto
+    # Without PyTorch's notes, which quote the source lines and their paths on this machine, the
+    # same policy gives the same file everywhere.
+    for node in model.graph.node:
+        del node.metadata_props[:]
+    path.write_bytes(model.SerializeToString())
 
 
 # ---------------------------------------------------------------------------------------------

@@ -414,6 +414,12 @@ def test_check_finds_an_interface_that_says_something_else(
         assert export.check(tmp_path, "torchscript", LOW, high).difference > TOLERANCE
 
 
+@pytest.mark.parametrize("name", ["low", "high"])
+def test_a_graph_does_not_say_where_it_was_made(folder: Path, name: str) -> None:
+    """PyTorch notes the source file of every operation; with it, the path of the installation."""
+    assert b".py" not in (folder / f"{name}.onnx").read_bytes()
+
+
 @pytest.mark.parametrize("form", FORMATS)
 def test_clock_does_not_drift(folder: Path, form: str) -> None:
     """1000 steps at 3.7 Hz are right to 1e-11; with 0.02 s rounded to float32: 3e-8 off by then."""

@@ -27,7 +27,7 @@ from tdgc.sim.robot import (
     rotation_matrix,
     walking_pose,
 )
-from tdgc.sim.urdf import JOINTS, merged_file, urdf_path
+from tdgc.sim.urdf import JOINTS, merged_file, read_urdf, urdf_path
 from tdgc.sim.world import World
 from tdgc.tasks import rewards
 from tdgc.tasks.low_env import LowLevelTask
@@ -368,7 +368,7 @@ def test_what_is_fixed_moves_with_its_carrier(
     """Merged links move and stop rays as in Bullet, which simulates each as a separate body."""
     config = changed(tmp_path, ("</robot>", TURNED)) if which == "turned" else None
     config = config or request.getfixturevalue("a1")
-    with merged_file(config) as merged:
+    with merged_file(read_urdf(config)) as merged:
         assert merged.read_text(encoding="utf-8").count("<link ") == 13
         (one, seen), (other, seen_too) = by_itself(urdf_path(config)), by_itself(merged)
     assert not merged.exists()
@@ -378,7 +378,7 @@ def test_what_is_fixed_moves_with_its_carrier(
 
 
 def test_nothing_fixed_nothing_written() -> None:
-    with merged_file(RobotConfig()) as merged:
+    with merged_file(read_urdf(RobotConfig())) as merged:
         assert merged == urdf_path(RobotConfig())
 
 
@@ -395,7 +395,7 @@ def test_meshes_are_found_from_elsewhere(tmp_path: Path) -> None:
     path.write_text(
         SHIPPED.replace("</robot>", TURNED.replace("<collision>", shapes + "<collision>"))
     )
-    with merged_file(RobotConfig(urdf=str(path))) as merged:
+    with merged_file(read_urdf(RobotConfig(urdf=str(path)))) as merged:
         found = re.findall('mesh filename="(.*?)"', merged.read_text())
     assert [Path(name).is_file() for name in found] == [True, True, True, False, False]
     assert found[3:] == ["hull.stl", "package://dog/x.stl"]

@@ -61,16 +61,21 @@ class Geometry:
 
 
 def read_geometry(config: RobotConfig) -> Geometry:
-    """Read the geometry of the robot whose URDF ``config`` names.
-
-    Every call reads the file; a world reads it once and keeps the result. docs/robot.md lists what
-    a URDF must have.
+    """Read the geometry of the robot whose URDF ``config`` names; every call reads the file.
 
     Raises:
-        ConfigError: a file that is missing, cannot be read or does not describe a robot of this
-            kind; the message says what is wrong with it and what is allowed.
+        ConfigError: a file that is missing or cannot be read, or see ``geometry_of``.
     """
-    urdf = read_urdf(config)
+    return geometry_of(read_urdf(config))
+
+
+def geometry_of(urdf: Urdf) -> Geometry:
+    """The geometry of a robot. docs/robot.md lists what its URDF must have.
+
+    Raises:
+        ConfigError: it does not describe a robot of this kind; the message says what is wrong with
+            it and what is allowed.
+    """
     with named(urdf.path):
         return _measure(urdf)
 

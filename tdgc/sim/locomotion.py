@@ -1,4 +1,4 @@
-"""The executor shared by both policies: robots in a world, driven by commands and actions.
+"""Robots in a world, driven by commands and by the low policy's actions.
 
 ``Locomotion`` turns the low policy's actions into joint targets, keeps the phase clock and the
 histories, applies domain randomisation and builds the low policy's observation s^L of Sec. IV-A. It
@@ -69,6 +69,21 @@ def check_randomisation(
                 f"'randomisation.{name}' times its scale must be from {least:g} to {greatest:g}, "
                 f"not [{low:g}, {high:g}]"
             )
+
+
+def check_robot(
+    robot: RobotConfig, physics: PhysicsConfig, randomisation: RandomisationConfig
+) -> None:
+    """Check that the robot can be simulated with these disturbances.
+
+    Raises:
+        ConfigError: an unusable URDF, or a range outside what is allowed; the message says which.
+    """
+    world = World(1, robot, physics)
+    try:
+        check_randomisation(randomisation, physics, world.state.geometry.trunk_mass)
+    finally:
+        world.close()
 
 
 class Locomotion:

@@ -116,13 +116,9 @@ def named(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def merged_file(config: RobotConfig) -> Iterator[Path]:
-    """URDF of the same robot with fixed links merged: a temporary file, or its own if it has none.
-
-    Raises:
-        ConfigError: see ``read_urdf``.
-    """
-    urdf = read_urdf(config)
+def merged_file(urdf: Urdf) -> Iterator[Path]:
+    """URDF of the same robot with fixed links merged: a temporary file, or its own if it has
+    none."""
     if all(len(parts) == 1 for parts in urdf.parts.values()):
         yield urdf.path
         return

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
-from tdgc.sim.geometry import read_geometry
+from tdgc.sim.geometry import geometry_of
 from tdgc.sim.robot import (
     GRAVITY,
     NUM_JOINTS,
@@ -32,7 +32,7 @@ from tdgc.sim.robot import (
 )
 from tdgc.sim.rotors import excess_momentum
 from tdgc.sim.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
-from tdgc.sim.urdf import JOINTS, merged_file, urdf_path
+from tdgc.sim.urdf import JOINTS, merged_file, read_urdf, urdf_path
 
 _GROUND, _ROBOT = 1, 2  # collision groups: robots collide with the ground only
 _TRUNK = -1  # Bullet's index of a body's root link
@@ -93,6 +93,7 @@ class World:
 
     Raises:
         ConfigError: the robot's URDF is missing, or not of a robot that this package can drive.
+        ValueError: ``field`` has not one row per robot.
 
     Attributes:
         state: the ``RobotState`` after the last step, push or reset.
@@ -120,16 +121,17 @@ class World:
         self.strength = np.ones((num_robots, 1))
         self.joint_friction = np.zeros((num_robots, 1))
         self.bullet_seconds = 0.0
-        self.state = RobotState.zeros(read_geometry(robot), num_robots)
+        urdf = read_urdf(robot)
+        self.state = RobotState.zeros(geometry_of(urdf), num_robots)
         check_nominal_pose(robot, self.state.geometry)
         self._clients: list[_Client] = []
         self._bodies: list[int] = []
         self._client_of: list[_Client] = []
         parts = -(-num_robots // CLIENT_ROBOTS)
         try:
-            with merged_file(robot) as urdf:
+            with merged_file(urdf) as file:
                 for rows in np.array_split(np.arange(num_robots), parts):
-                    self._connect(rows, urdf, window)
+                    self._connect(rows, file, window)
         except BaseException:
             self.close()
             raise
@@ -390,7 +392,8 @@ class World:
         state.derive()
 
     def retire(self, index: ArrayLike) -> None:
-        """Remove the robots ``index`` permanently; their rows of ``state`` stay as they are."""
+        """Remove the robots ``index`` permanently; their rows of ``state`` keep the last pose and
+        velocities."""
         for i in np.asarray(index):
             self._client_of[i].removeBody(self._bodies[i])
         self._active = np.setdiff1d(self._active, index)
@@ -568,15 +571,6 @@ class World:
             if client.isConnected():  # the user may have closed the window
                 client.disconnect()
         self._clients.clear()
-
-
-def check_robot(robot: RobotConfig, physics: PhysicsConfig) -> None:
-    """Check that the robot can be simulated.
-
-    Raises:
-        ConfigError: an unusable URDF; the message names it.
-    """
-    World(1, robot, physics).close()
 
 
 class WindowError(RuntimeError):

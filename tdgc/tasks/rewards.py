@@ -35,7 +35,7 @@ class LowStep:
         command: (M, 15).
         phases: (M, 4) warped foot phases; contact: (M, 4) desired contact C; swing: (M, 4)
             profile of the swing.
-        base_height: (M,) m, trunk above the ground under it.
+        base_height: (M,) m, trunk above the support surface under the hips.
         foot_height: (M, 4) m, foot centre above the support surface under it.
         standing_height: m, to which the body height command is added.
         stance: (2,) m, length and width between the footholds at the default commands.
