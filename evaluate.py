@@ -25,7 +25,7 @@ from tdgc.benchmark.cues import CuesLaw
 from tdgc.benchmark.diagnosis import Diagnosis, diagnose
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
 from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, plan, run_cell
-from tdgc.benchmark.flags import add_arguments, choose, read
+from tdgc.benchmark.flags import add_arguments, choose, resolve
 from tdgc.benchmark.recording import Recorder, Recording
 from tdgc.benchmark.results import STOPS, describe, make_room, salvage, what_stopped, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
@@ -187,7 +187,7 @@ class Evaluation:
         shipped = SHIPPED_HIGH if SHIPPED_HIGH.with_suffix(".json").is_file() else None
         high = flags.high or shipped
         automatic = flags.workers == "auto"
-        read(flags)
+        resolve(flags)
         default = "gp" if high is None else "all"
         asked = default if flags.policies is None else flags.policies
         conditions = "nominal" if flags.conditions is None else flags.conditions
@@ -361,7 +361,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
         diagnosis.write(diagnoses, out / "diagnosis.csv")
         print(f"\n{diagnosis.describe(diagnoses, episodes)}")
     if e.tuning is not None:
-        effect = tuning.compare(episodes, "tdgc", TUNED)
+        effect = tuning.effect(episodes, "tdgc", TUNED)
         result = {"tuning": tuning.record(e.tuning), "effect": effect}
         write_json(out / "tuning.json", result)
         print_effect(effect)

@@ -28,6 +28,7 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
+from tdgc.errors import StoppedError
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.ppo import NoiseScaledRate, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
@@ -99,10 +100,6 @@ def fit(config: LowTrainConfig, assignments: Sequence[str]) -> LowTrainConfig:
     listed = " ".join(f"env.robot.{name}={value}" for name, value in values.items())
     tqdm.write(f"from {config.env.robot.urdf}: {listed}")
     return config
-
-
-class StoppedError(Exception):
-    """Raised when calibration is interrupted."""
 
 
 def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> None:

@@ -1,4 +1,5 @@
-"""Errors about unusable input, with one-line messages, and a check for optional packages."""
+"""Errors about unusable input, with one-line messages, interruptions, and a check for optional
+packages."""
 
 import importlib.util
 
@@ -12,6 +13,10 @@ class InputError(ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
+
+
+class StoppedError(Exception):
+    """A signal or the time limit came before something was done."""
 
 
 def require(what: str, packages: tuple[str, ...], extra: str) -> None:

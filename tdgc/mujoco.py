@@ -257,7 +257,7 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
     require("MuJoCo's benchmark", _PACKAGES, "mujoco")
     from tdgc.sim.mujoco_world import MujocoConfig
 
-    flags.read(args)
+    flags.resolve(args)
     if not 0 <= args.log <= args.episodes:
         raise ValueError(f"--log must lie in [0, --episodes], not {args.log}")
     for flag, value in (("--video", args.video), ("--log", args.log)):

@@ -19,7 +19,7 @@ import evaluate
 from tdgc.benchmark import evaluation
 from tdgc.benchmark.drivers import BaselineDriver
 from tdgc.benchmark.evaluation import Cell, run_cell, tile_of
-from tdgc.benchmark.recording import Recorder, Recording, spans, stretches
+from tdgc.benchmark.recording import Recorder, Recording, runs_of_equal, spans
 from tdgc.config import CommandRanges, RobotConfig
 from tdgc.show import film, plots
 from tdgc.sim.commands import default_command
@@ -120,8 +120,8 @@ def test_bars_of_contact() -> None:
     flags = np.array([1, 1, 0, 0, 1, 0, 1, 1, 1], dtype=bool)
     assert spans(flags) == [(0, 2), (4, 5), (6, 9)]
     assert spans(np.zeros(3, dtype=bool)) == [] and spans(np.ones(3, dtype=bool)) == [(0, 3)]
-    assert stretches(np.array([2, 2, 0, 0, 0, 2])) == [(0, 2, 2), (2, 5, 0), (5, 6, 2)]
-    assert stretches(np.array([1])) == [(0, 1, 1)]
+    assert runs_of_equal(np.array([2, 2, 0, 0, 0, 2])) == [(0, 2, 2), (2, 5, 0), (5, 6, 2)]
+    assert runs_of_equal(np.array([1])) == [(0, 1, 1)]
 
 
 # ------------------------------------------------------------------ frames

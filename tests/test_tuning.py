@@ -22,7 +22,7 @@ from tdgc.benchmark.tuning import (
     TunedDriver,
     Tuning,
     check,
-    compare,
+    effect,
     load,
     record,
     tuned_ranges,
@@ -310,7 +310,7 @@ def test_the_comparison_is_of_the_same_tiles():
         row("tdgc-tuned", 1, "reached", 12.0, 7.0, 350.0),
         row("tdgc-tuned", 2, "reached", 16.0, 8.0, 400.0),
     ]  # fmt: skip
-    found = compare(rows, "tdgc", "tdgc-tuned")["nominal"]
+    found = effect(rows, "tdgc", "tdgc-tuned")["nominal"]
     before, after = found["tdgc"], found["tdgc-tuned"]
     assert (before["n"], before["reached"], after["reached"]) == (3, 2, 2)
     assert (found["gained"], found["lost"]) == (1, 1)
@@ -319,7 +319,7 @@ def test_the_comparison_is_of_the_same_tiles():
     assert before["energy_per_metre"] == pytest.approx(100.0)
     assert after["energy_per_metre"] == pytest.approx(50.0)
     still = [row("tdgc", 0, "timeout", 20.0, 0.0, 9.0), row("tdgc-tuned", 0, "fell", 1.0, 0.0, 1.0)]
-    assert compare(still, "tdgc", "tdgc-tuned")["nominal"]["tdgc"]["energy_per_metre"] is None
+    assert effect(still, "tdgc", "tdgc-tuned")["nominal"]["tdgc"]["energy_per_metre"] is None
 
 
 @pytest.mark.usefixtures("in_process")

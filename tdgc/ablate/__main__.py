@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from tdgc.ablate.table import Found, describe, rows
-from tdgc.ablate.trials import Runner, StoppedError, Tile, Trial, TrialError, uncalibrated
+from tdgc.ablate.trials import Runner, Tile, Trial, TrialError, uncalibrated
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
-from tdgc.errors import InputError
+from tdgc.errors import InputError, StoppedError
 from tdgc.files import write_json, write_text
 from tdgc.parallel.cores import workers_flag
 from tdgc.show import plots

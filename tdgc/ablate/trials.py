@@ -25,7 +25,7 @@ import train_high
 from tdgc import policies
 from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
-from tdgc.errors import InputError
+from tdgc.errors import InputError, StoppedError
 from tdgc.files import write_json
 from tdgc.parallel.cores import Workers
 from tdgc.sim.terrain import UNNAMED
@@ -40,10 +40,6 @@ FACTS = ("steps", "train_seconds", "simulated_hours")
 
 class TrialError(InputError):
     """A trial cannot be trained or evaluated; the message is one line."""
-
-
-class StoppedError(Exception):
-    """A signal or the time limit came before a trial was done."""
 
 
 @dataclass(frozen=True)

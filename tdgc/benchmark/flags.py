@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
     return groups
 
 
-def read(args: argparse.Namespace) -> None:
+def resolve(args: argparse.Namespace) -> None:
     """Parse levels, families and workers in place, and check the other flags.
 
     Raises:

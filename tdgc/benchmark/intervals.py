@@ -67,7 +67,7 @@ def rates(reached: ArrayLike) -> dict[str, float]:
     """
     every = np.atleast_2d(np.asarray(reached, dtype=bool))
     n, good = every.size, int(every.sum())
-    low, high = wilson_interval(good, n, Z_95 * wider(every))
+    low, high = wilson_interval(good, n, Z_95 * design_factor(every))
     return {"n": n, "reached": good, "rate": good / n, "ci_low": low, "ci_high": high}
 
 
@@ -87,7 +87,7 @@ def difference(pairs: ArrayLike) -> dict[str, float]:
     both, gained, lost, neither = (
         int(found.sum()) for found in (one & other, one & ~other, ~one & other, ~one & ~other)
     )
-    z = Z_95 * wider(one.astype(float) - other)
+    z = Z_95 * design_factor(one.astype(float) - other)
     low, high = paired_interval(both, gained, lost, neither, z)
     return {
         "n": one.size,
@@ -99,7 +99,7 @@ def difference(pairs: ArrayLike) -> dict[str, float]:
     }
 
 
-def wider(values: NDArray[Any]) -> float:
+def design_factor(values: NDArray[Any]) -> float:
     """Factor by which the interval of a mean over ``values`` (seeds, n) is wider than it would be
     if each value came from its own tile.
 

@@ -97,7 +97,7 @@ class Blindfold(HierarchyDriver):
 
 
 @dataclass(frozen=True)
-class Fault:
+class PlantedFault:
     """A fault to plant in a pair.
 
     Attributes:
@@ -113,7 +113,7 @@ class Fault:
 
 FAULTS = (
     *(
-        Fault(
+        PlantedFault(
             f"{what} motor at {100 * _WEAK:g} % strength",
             "execution",
             functools.partial(WeakMotor, joint=joint),
@@ -126,12 +126,12 @@ FAULTS = (
         )
     ),
     *(
-        Fault(
+        PlantedFault(
             f"bounds of {name} swapped", "decisions", functools.partial(SwappedBounds, command=name)
         )
         for name in ("vx", "vy", "yaw_rate")
     ),
-    Fault("a blindfolded high policy", "decisions", Blindfold),
+    PlantedFault("a blindfolded high policy", "decisions", Blindfold),
 )
 
 
@@ -152,7 +152,7 @@ def blamed(
     return [diagnose(t, hips).layer for t in traces if t.outcome != "reached"]
 
 
-def stretches(trace: Trace) -> Iterator[NDArray[np.bool_]]:
+def time_windows(trace: Trace) -> Iterator[NDArray[np.bool_]]:
     """Yield masks, (n - 1,), of an episode's intervals in successive stretches of ``LOOK_BACK`` s
     from ``SETTLE`` on."""
     begins, end = trace["time"][:-1], trace["time"][-1]
@@ -170,7 +170,7 @@ def measured_limits(traces: Sequence[Trace], hips: float) -> Mapping[str, tuple[
     errors: dict[tuple[str, bool], list[float]] = defaultdict(list)
     for trace in traces:
         clear, whole = free(trace, tile_under(trace), hips), settled(trace)
-        for is_whole, intervals in ((True, whole), *((False, s) for s in stretches(trace))):
+        for is_whole, intervals in ((True, whole), *((False, s) for s in time_windows(trace))):
             for name, error in tracking_errors(trace, intervals & clear).items():
                 errors[name, is_whole].append(error)
 

@@ -122,7 +122,7 @@ def spans(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def stretches(values: NDArray[np.int64]) -> list[tuple[int, int, int]]:
+def runs_of_equal(values: NDArray[np.int64]) -> list[tuple[int, int, int]]:
     """Return the runs of equal ``values`` (n,) as (begin, end, value); together they cover all."""
     cuts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
     return [(a, b, int(values[a])) for a, b in itertools.pairwise(cuts)]

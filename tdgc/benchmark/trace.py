@@ -37,7 +37,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.terrain import TileField
 from tdgc.tasks import rewards
-from tdgc.tasks.high_env import command_share, high_step
+from tdgc.tasks.high_env import high_step, shares_of_ranges
 from tdgc.tasks.probes import NUM_PROBES, PROBES
 from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
 
@@ -202,10 +202,10 @@ class Tracer:
         self._cell, self._loco, self._goal = cell, loco, goal
         self._origin = field.origin(np.arange(m), 0)
         self._dt = loco.physics.control_dt
-        self._hold = config.decimation
-        self._horizon = round(config.episode_seconds / (self._hold * self._dt))
+        self._decimation = config.decimation
+        self._horizon = round(config.episode_seconds / (self._decimation * self._dt))
         self._decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
-        middle = command_share(self._decoder.decode(np.zeros(NUM_ACTIONS)), self._decoder)
+        middle = shares_of_ranges(self._decoder.decode(np.zeros(NUM_ACTIONS)), self._decoder)
         self._shares = np.tile(middle, (3, m, 1))
         self._actions = np.zeros((2, m, NUM_ACTIONS))
         self._steps = np.zeros(m, dtype=int)
@@ -216,11 +216,11 @@ class Tracer:
         self._look()
 
     def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
-        if step % self._hold == 0:
+        if step % self._decimation == 0:
             self._decide(live)
         self._measure(live)
         self._outcome = outcome.copy()
-        if (step + 1) % self._hold == 0:
+        if (step + 1) % self._decimation == 0:
             self._look()
 
     def traces(self) -> list[Trace]:
@@ -260,7 +260,7 @@ class Tracer:
         row.update(command_columns(command, self._loco.carried_out, driver.bounds))
         if driver.probes is not None:
             row.update(probe_columns(driver.probes))
-        share = command_share(command, self._decoder)
+        share = shares_of_ranges(command, self._decoder)
         self._shares = np.concatenate([share[None], self._shares[:-1]])
         self._clear()
 
@@ -320,7 +320,7 @@ class Tracer:
         seen = high_step(
             self._loco, self._goal, share, self._actions, self._shares, self._force, config
         )
-        for name, value in rewards.high_terms(seen, self._hold * self._dt).items():
+        for name, value in rewards.high_terms(seen, self._decimation * self._dt).items():
             if name != "action_rate" or self._driver.action is not None:
                 row[f"reward_{name}"] = value
 

@@ -249,7 +249,7 @@ class TunedDriver(HierarchyDriver):
 # ---------------------------------------------------------------------------- effect of a tuning
 
 
-def compare(episodes: Sequence[Episode], before: str, after: str) -> dict[str, Any]:
+def effect(episodes: Sequence[Episode], before: str, after: str) -> dict[str, Any]:
     """Compare two policies on the same tiles: condition -> policy -> figures, and what changed.
 
     Figures are ``success`` and, pooled over all of a policy's episodes, ``mean_speed`` in m/s along

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 from tdgc.benchmark.evaluation import tile_of
-from tdgc.benchmark.recording import Recording, spans, stretches
+from tdgc.benchmark.recording import Recording, runs_of_equal, spans
 from tdgc.config import PhysicsConfig, RobotConfig
 from tdgc.errors import InputError, require
 from tdgc.files import atomic
@@ -224,7 +224,7 @@ class Overlay:
         scale = (right - left) / n
         seen = slice(max(0, first), i + 1)
         begin = left + scale * (seen.start - first)
-        for a, b, gait in stretches(self._gait[seen]):
+        for a, b, gait in runs_of_equal(self._gait[seen]):
             draw.rectangle([begin + scale * a, top, begin + scale * b, top + 6], GAIT_COLOURS[gait])
         for foot, name in enumerate(FEET):
             y = top + 12 + 20 * foot

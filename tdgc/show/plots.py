@@ -22,7 +22,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from tdgc.benchmark.evaluation import POSE_SECONDS, tile_of
-from tdgc.benchmark.recording import Recording, spans, stretches
+from tdgc.benchmark.recording import Recording, runs_of_equal, spans
 from tdgc.benchmark.results import policies_of
 from tdgc.files import atomic
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, gait_index
@@ -369,7 +369,7 @@ def sheet(recording: Recording, out: Path) -> None:
 
 def _draw_contacts(axis: Any, r: Recording) -> None:
     """Draw the gait as a band, and below it a row per foot with desired and actual contact."""
-    for a, b, gait in stretches(gait_index(r.command)):
+    for a, b, gait in runs_of_equal(gait_index(r.command)):
         axis.broken_barh([(a * r.dt, (b - a) * r.dt)], (-0.75, 0.55), color=GAIT_COLOURS[gait])
     for foot in range(len(FEET)):
         for flags, thick, colour in (

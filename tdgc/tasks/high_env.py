@@ -33,7 +33,7 @@ from tdgc.tasks.teacher import WAY, Skill, Teacher
 from tdgc.tasks.tiles import TrainingTiles, shallow
 
 
-def command_share(commands: Array, decoder: CommandDecoder) -> Array:
+def shares_of_ranges(commands: Array, decoder: CommandDecoder) -> Array:
     """Commands (..., 15) as shares of the decoder's ranges, which puts differences on one scale."""
     span = np.where(decoder.high > decoder.low, decoder.high - decoder.low, 1)
     return np.asarray((commands - decoder.low) / span)
@@ -55,7 +55,7 @@ def high_step(
         goal: (M, 2) m in the world.
         time_share: t / T_max, (M,) or a single value for all robots.
         actions: (2, M, 13) of this decision and the one before, normalised.
-        shares: (3, M, 15) ``command_share`` of this decision and the two before.
+        shares: (3, M, 15) ``shares_of_ranges`` of this decision and the two before.
         force: (M, 5) N, largest contact forces since the decision: on the trunk, and on each leg
             above the foot.
         config: weights and constants.
@@ -123,7 +123,7 @@ class NavigationTask:
         self.rng = np.random.default_rng(seed)
         self.step_seconds = config.decimation * self.low_config.physics.control_dt
         self.horizon = round(config.episode_seconds / self.step_seconds)
-        self._hold = round(config.hold_seconds / self.step_seconds)
+        self._hold_decisions = round(config.hold_seconds / self.step_seconds)
         rank, self.family = np.divmod(first + np.arange(m), len(config.families))
         levels = rank % config.first_levels + config.first_level
         if config.curriculum == "hardest":
@@ -187,7 +187,7 @@ class NavigationTask:
             self._untold[index] = rng.uniform(size=n) < self._unknown_share
         self._actions[:, index] = 0.0
         middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
-        self._commands[:, index] = command_share(middle, self.decoder)
+        self._commands[:, index] = shares_of_ranges(middle, self.decoder)
         self.locomotion.command[index] = default_command()  # as in the evaluation
         self.locomotion.place(
             index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
@@ -228,7 +228,7 @@ class NavigationTask:
         self._decisions += 1
         self._actions = np.stack([self.decoder.normalise(actions), self._actions[0]])
         commands = self.decoder.decode(actions)
-        share = command_share(commands, self.decoder)
+        share = shares_of_ranges(commands, self.decoder)
         self._commands = np.concatenate([share[None], self._commands[:-1]])
         failed = np.zeros(self.num_robots, dtype=bool)
         force = np.zeros((self.num_robots, 5))
@@ -258,7 +258,7 @@ class NavigationTask:
         )
         terms = rewards.high_terms(seen, self.step_seconds)
         reward = np.sum(list(terms.values()), axis=0)
-        held = reached & (self.elapsed - self._reached_at >= self._hold)
+        held = reached & (self.elapsed - self._reached_at >= self._hold_decisions)
         truncated = ~failed & (held | (self.elapsed >= self.horizon))
         done = np.flatnonzero(failed | truncated)
         self._count(terms, reward, commands, done, reached)
