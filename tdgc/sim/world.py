@@ -441,11 +441,10 @@ class World:
         command, measure = pybullet.setJointMotorControlArray, pybullet.getJointStates
         strength, friction = self.strength[live], self.joint_friction[live]
         q, qd = state.q[live], state.qd[live]
-        armature, excess = self._armature[live], state.rotor_excess[live]
+        armature = self._armature[live]
+        excess = np.where(armature[:, None] > 0.0, state.rotor_excess[live], 0.0)
         rotors = armature.any()
-        if not rotors:
-            excess[:] = 0.0
-        else:
+        if rotors:
             rotation, momentum, _ = self._excess(client, bodies, q, qd)
         for target in wanted:
             torque = pd_torque(target - q, qd, strength, self.robot, friction)
@@ -484,8 +483,8 @@ class World:
     def _excess(
         self, client: _Client, bodies: list[int], q: Array, qd: Array
     ) -> tuple[Array, Array, Array]:
-        """Rotation matrices of the trunks of ``bodies`` (n,), (n, 3, 3), and
-        ``excess_momentum``."""
+        """Rotation matrices of the trunks of ``bodies`` (n,), (n, 3, 3), and the two parts of
+        ``excess_momentum``, (n, 15) each."""
         turned = [pybullet.getBasePositionAndOrientation(body, client.id)[1] for body in bodies]
         ang_vel = np.array([pybullet.getBaseVelocity(body, client.id)[1] for body in bodies])
         rotation = rotation_matrix(np.array(turned)) @ self._to_axes
