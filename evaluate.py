@@ -33,7 +33,7 @@ from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
 from tdgc.errors import InputError, require
-from tdgc.files import write_json
+from tdgc.files import make_folder, write_json
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
 from tdgc.parallel.cores import usable_cores
@@ -176,13 +176,15 @@ class Evaluation:
         """
         if flags.gui is not None and flags.tracking:
             raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
+        if flags.gui == "drive" and (flags.policies is not None or flags.high is not None):
+            raise ValueError("--gui drive is of the low policy alone: no --policies or --high")
         if flags.gui is not None and flags.conditions is not None:
             raise ValueError("--gui shows the nominal condition: no --conditions")
-        episodes = flags.policies, flags.conditions, flags.families, flags.levels
+        episodes = flags.policies, flags.conditions, flags.families, flags.levels, flags.high
         if flags.tracking and any(flag is not None for flag in episodes):
             raise ValueError(
                 "--tracking is of the low policy alone, on a plane: "
-                "no --policies, --conditions, --families or --levels"
+                "no --policies, --conditions, --families, --levels or --high"
             )
         shipped = SHIPPED_HIGH if SHIPPED_HIGH.with_suffix(".json").is_file() else None
         high = flags.high or shipped
@@ -246,6 +248,9 @@ class Evaluation:
         if self.mode in _LOW_ALONE:
             return {}
         drivers: dict[str, Driver] = {}
+        if "tdgc" in self.policies:  # refuse a misfit before anything is tried out
+            assert self.high is not None
+            pair = load_high(self.high, low, config)
         skill = self.skill(low, config) if {CUES, TEACHER} & set(self.policies) else None
         for name in self.policies:
             if name == "gp":
@@ -259,8 +264,6 @@ class Evaluation:
                 law = CuesLaw(config, skill, mdp)
                 drivers[name] = HierarchyDriver(law, mdp)
             else:
-                assert self.high is not None
-                pair = load_high(self.high, low, config)
                 drivers[name] = HierarchyDriver(*pair)
                 if self.tuning is not None:
                     drivers[TUNED] = TunedDriver(*pair, config, self.tuning)
@@ -269,7 +272,7 @@ class Evaluation:
     def make_room(self) -> None:
         """Create the results folder; only a table replaces an earlier one there."""
         if self.mode != "table":
-            self.out.mkdir(parents=True, exist_ok=True)
+            make_folder(self.out)
             return
         left = ["traces/*.parquet", "diagnosis.csv", "tuning.json", report.NAME]
         left += [name for name, *_ in report.FIGURES]
@@ -379,12 +382,19 @@ def editions(low: Policy, drivers: Mapping[str, Driver]) -> dict[str, int]:
     """Editions of the benchmark that the policies were trained on.
 
     Policies that do not record an edition are of the first.
+
+    Raises:
+        InputError: a policy's file has something else in place of an edition.
     """
     used = {"low": low}
     pair = drivers.get("tdgc")
     if isinstance(pair, HierarchyDriver) and isinstance(pair.high, Policy):
         used["high"] = pair.high
-    return {name: int(policy.meta.get("benchmark", 1)) for name, policy in used.items()}
+    found = {name: policy.meta.get("benchmark", 1) for name, policy in used.items()}
+    for name, edition in found.items():
+        if type(edition) is not int:
+            raise InputError(f"the {name} policy's 'benchmark' must be an edition, not {edition!r}")
+    return found
 
 
 def print_effect(effect: dict[str, Any]) -> None:
@@ -443,6 +453,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         fail(error)
         return 2
+    except KeyboardInterrupt as error:  # while the teacher's speeds are tried out
+        fail(what_stopped(error))
+        sys.exit(1)  # instead of returning, so that the caller stops, too
     problems: list[str] = []
     try:
         if evaluation.mode == "tracking":

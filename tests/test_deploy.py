@@ -185,6 +185,34 @@ def test_graphs_run_in_order_and_hand_their_values_on(controller: Controller) ->
     assert controller.high.values["clock"][0] == 0.0
 
 
+@pytest.mark.parametrize("name", ["gyro", "probes", "goal"])
+def test_a_reading_that_is_not_finite_is_refused_and_not_remembered(
+    controller: Controller, name: str
+) -> None:
+    robot, goal = state(controller), np.array([6.0, 0.0])
+    readings = controller.sense(robot, goal, "rough", level)
+    controller.reset()
+    expected = [controller.step(readings) for _ in range(11)]
+    controller.reset()
+    for step in range(11):
+        if step in ((5, 6) if name == "gyro" else (5,)):  # a decision, and a step without one
+            broken = {**readings, name: np.full_like(readings[name], np.nan)}
+            with pytest.raises(ExportError, match=rf"^'{name}' is not finite"):
+                controller.step(broken)
+        np.testing.assert_array_equal(controller.step(readings), expected[step])
+
+
+def test_graphs_of_two_exports_are_refused(folder: Path, tmp_path: Path) -> None:
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    path = tmp_path / "high_interface.json"
+    table = json.loads(path.read_text())
+    table["probes"]["plane_below_trunk"]["value"] = 0.28
+    path.write_text(json.dumps(table))
+    with pytest.raises(ExportError, match=r"low and high in '.*' are of two exports"):
+        Controller(tmp_path, FORM)
+
+
 def test_it_stands_after_the_goal_and_after_the_horizon(controller: Controller) -> None:
     task = controller.high.table["task"]
     stand = np.array(task["stand"]["value"])

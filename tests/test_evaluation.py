@@ -346,14 +346,16 @@ def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, cap
 
 ALONE = (
     "--tracking is of the low policy alone, on a plane: "
-    "no --policies, --conditions, --families or --levels"
+    "no --policies, --conditions, --families, --levels or --high"
 )
 NOT_OF_TRACKING = (
     ("--policies", "gp"),
     ("--conditions", "nominal"),
     ("--families", "all"),
     ("--levels", "6-10"),
+    ("--high", "elsewhere/high"),
 )
+GUI_DRIVE = "--gui drive is of the low policy alone: no --policies or --high"
 GUI_CONDITION = "--gui shows the nominal condition: no --conditions"
 
 
@@ -372,6 +374,10 @@ GUI_CONDITION = "--gui shows the nominal condition: no --conditions"
         *(
             (["--gui", mode, "--conditions", "pushes"], GUI_CONDITION)
             for mode in ("drive", "watch")
+        ),
+        *(
+            (["--gui", "drive", flag, value], GUI_DRIVE)
+            for flag, value in (("--policies", "gp"), ("--high", "elsewhere/high"))
         ),
         (["--workers", "0"], "--workers must be at least 1, not 0"),
         (["--seed", "-1"], "--seed must lie in [0, 2**32), not -1"),

@@ -392,7 +392,7 @@ def without_sources(table: dict[str, Any]) -> None:
         ("high", without_sources, ""),
         ("high", lambda t: t["order"].reverse(), "order["),
         ("high", lambda t: t["order"][0].update(every=4), ""),
-        ("high", lambda t: t["probes"]["plane_below_trunk"].update(value=0.31), ""),
+        ("high", lambda t: t["probes"]["plane_below_trunk"].update(value=0.31), "two exports"),
         ("high", lambda t: t["probes"]["ahead_left"]["value"].reverse(), ""),
         ("high", lambda t: t["families"].reverse(), ""),
         ("high", lambda t: t["task"]["horizon"].update(value=2.0), ""),

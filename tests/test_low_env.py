@@ -390,7 +390,7 @@ def test_a_crossing_robot_is_sent_to_its_waypoint(yaw: float) -> None:
     task.episodes.speed[:], task.episodes.facing[:] = 0.5, 0.4
     origin = task.field.origin(0, 0)
     task.episodes.waypoint[0] = origin + [7.25, 4.5]
-    task.crossings.steer(task.locomotion, task.ground)
+    task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     vx, vy, turning = task.locomotion.command[0, :3]
     c, s = math.cos(yaw), math.sin(yaw)
     world = np.array([c * vx - s * vy, s * vx + c * vy])
@@ -412,10 +412,10 @@ def test_crossing_velocities_keep_their_direction_within_the_ranges() -> None:
     task.episodes.crossing[:], task.episodes.facing[:], task.episodes.speed[:] = True, 0.0, 1.0
     put(task, 0, (2.0, 4.0), -math.pi / 2)
     task.episodes.waypoint[0] = task.field.origin(0, 0) + [7.25, 4.0]
-    task.crossings.steer(task.locomotion, task.ground)
+    task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     np.testing.assert_allclose(task.locomotion.command[0, :3], [0.0, 0.6, 1.0], atol=1e-9)
     put(task, 0, (2.0, 4.0), -math.pi / 4)
-    task.crossings.steer(task.locomotion, task.ground)
+    task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     np.testing.assert_allclose(task.locomotion.command[0, :2], [0.6, 0.6], atol=1e-9)
     task.close()
 
@@ -427,11 +427,11 @@ def test_an_episode_ends_with_the_crossing() -> None:
     origin = task.field.origin(0, 0)
     task.episodes.waypoint[0] = origin + [7.25, 4.4]
     put(task, 0, (6.7, 4.4))
-    task.crossings.steer(task.locomotion, task.ground)
+    task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     assert not task.episodes.reached[0]
     assert not task.step(still(task))[2][0]
     put(task, 0, (6.8, 4.4))
-    task.crossings.steer(task.locomotion, task.ground)
+    task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     assert task.reached[0]
     _, terminated, truncated = task.step(still(task))
     assert truncated[0] and not terminated[0]
@@ -671,7 +671,7 @@ def test_pitch_follows_the_slope_of_a_crossing() -> None:
     task.ground = measure_ground(task.locomotion)
     slope = task.ground.slope()[0]
     assert 0.25 < slope < 0.6  # 15 cm steps on treads of 25 to 40 cm
-    task.crossings.steer(task.locomotion, task.ground)
+    task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     pitch = task.locomotion.command[:, INDEX["pitch"]]
     np.testing.assert_allclose(pitch, [0.05 - 0.5 * slope, 0.05])
     task.close()
@@ -833,6 +833,24 @@ def test_planned_leaps_go_on_from_a_state() -> None:
     assert (task.episodes.leaping & (task.episodes.elapsed > 5)).any()
     task.close()
     other.close()
+
+
+def test_a_reset_leaves_the_commands_of_other_robots() -> None:
+    """Also where their strides are due: planned twice, a stride would depend on who else fell."""
+    pronk = dataclasses.replace(TILES.crossing, share=1.0, trench_gaits=(0.0, 1.0, 0.0, 0.0))
+    config = dataclasses.replace(TILES, families=("gap",), crossing=pronk)
+    task = LowLevelTask(config, 3, seed=5)
+    task.restart()
+    due = 0
+    for _ in range(60):
+        task.step(np.zeros((3, 12)))
+        others = task.locomotion.command[1:].copy()
+        elapsed = task.episodes.elapsed[1:]
+        due += int((task.episodes.leaping[1:] & (elapsed % pronk.leap_decimation == 0)).sum())
+        task.reset(np.array([0]))
+        np.testing.assert_array_equal(task.locomotion.command[1:], others)
+    assert due > 10
+    task.close()
 
 
 def test_velocities_of_a_crossing_stay_within_their_bounds() -> None:

@@ -129,9 +129,10 @@ def test_a_tile_of_a_height_map(tmp_path):
         (np.full((161, 161), np.nan), "must hold finite heights"),
         (np.zeros((161, 161), dtype=bool), "must hold finite heights"),
         (np.array([{}], dtype=object), "cannot be read as a NumPy file: .*allow_pickle"),
+        (np.full((161, 161), -128, dtype=np.int8), r"must stay within 2\.08333 m"),
         (np.full((161, 161), -2.1), r"must stay within 2\.08333 m of the platforms' height$"),
     ],
-    ids=["none", "text", "shape", "nan", "bool", "pickle", "deep"],
+    ids=["none", "text", "shape", "nan", "bool", "pickle", "int8", "deep"],
 )
 def test_a_height_map_that_cannot_be_used(content, message, tmp_path):
     path = tmp_path / "map.npy"

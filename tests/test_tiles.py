@@ -3,9 +3,10 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from tdgc.sim.terrain import Tile, make_tile, tile_rng
-from tdgc.tasks.tiles import FLAT, TrainingTiles
+from tdgc.tasks.tiles import FLAT, TrainingTiles, check_families
 
 FAMILIES = ("stair", FLAT, "rough")
 ALL = np.arange(3)
@@ -64,3 +65,9 @@ def test_numbers_are_enough_to_draw_the_tiles_again() -> None:
     for a, b in ((tiles, other), (other, tiles)):
         assert a.begin(np.array([2]), LEVELS).tolist() == []
         assert (a.state_dict()["number"] == b.state_dict()["number"]).all()
+
+
+def test_mixed_is_kept_for_evaluation() -> None:
+    check_families(("stair", "gap"))
+    with pytest.raises(ValueError, match="must not name 'mixed', which is kept for evaluation"):
+        check_families(("stair", "mixed"))

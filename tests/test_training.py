@@ -40,6 +40,7 @@ from tdgc.config import (
 )
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import add_arguments, configure
+from tdgc.learn.ppo import LinearRate
 from tdgc.learn.run import Interruption, append_line, drop_rows_after, tensorboard_logger
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
@@ -247,6 +248,21 @@ def test_rows_that_a_resumed_run_writes_again_are_dropped(tmp_path: Path) -> Non
     assert log.read_text().split("\n") == [*lines[:2], '{"steps": 260}', ""]
 
 
+@pytest.mark.parametrize("tail", [b'{"steps": 3', b"\0\0\0\0", b"\xff\xfe", b"{}"])
+def test_a_row_that_a_crash_cut_short_is_dropped(tail: bytes, tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    log.write_bytes(b'{"steps": 100}\n{"steps": 200}\n' + tail)
+    drop_rows_after(250, log)
+    assert log.read_text() == '{"steps": 100}\n{"steps": 200}\n'
+
+
+def test_the_learning_rate_of_a_rollout_beyond_the_run() -> None:
+    """SB3 gives it a remaining share below 0; the rate stays at its last value."""
+    rate = LinearRate(1e-3, 1e-4)
+    assert [rate(share) for share in (1.0, 0.5, 0.0)] == pytest.approx([1e-3, 5.5e-4, 1e-4])
+    assert rate(-2.0) == 1e-4
+
+
 def test_tensorboard_shows_what_a_resumed_run_wrote_again_once(tmp_path: Path) -> None:
     for begins, rows_of in ((0, {100: 1.0, 200: 2.0, 300: 3.0}), (200, {300: 4.0})):
         logger = tensorboard_logger(tmp_path, begins)
@@ -263,6 +279,10 @@ def test_time_limit() -> None:
     assert not Interruption(None).due() and not Interruption(1000.0).due()
     over = Interruption(-1.0)
     assert over.due() and over.reason == "the time limit"
+    os.kill(os.getpid(), signal.SIGTERM)  # the first signal; the last checkpoint is being written
+    assert over.due() and over.reason == "the time limit"
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

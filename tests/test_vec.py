@@ -113,6 +113,19 @@ def test_other_workers_go_on_from_the_states() -> None:
     other.close()
 
 
+def test_states_of_another_configuration_are_refused_in_one_line() -> None:
+    """The error comes from a worker and names what differs."""
+    probe = make_robots(1, 0)
+    spaces = probe.observation_space, probe.action_space
+    probe.close()
+    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
+    states = env.state_dicts()
+    states[1]["obs"] = states[1]["obs"][:, :-1]
+    with pytest.raises(ValueError, match=r"^the state does not fit the configuration: .*shape"):
+        env.load_state_dicts(states)
+    env.close()
+
+
 def test_ends_of_episodes(counters: TaskVecEnv) -> None:
     """Robots 0, 1 and 0, 1, 2 of the two workers end after 2, 3 and 2, 3, 4 steps."""
     first = counters.reset()

@@ -11,7 +11,7 @@ import numpy as np
 from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
 from tdgc.errors import InputError
-from tdgc.files import atomic, write_json
+from tdgc.files import atomic, make_folder, write_json
 from tdgc.parallel.worker import WorkerError
 from tdgc.sim.terrain import EDITION
 
@@ -37,7 +37,7 @@ def make_room(out: Path, patterns: Sequence[str], folders: Mapping[str, bool]) -
         patterns: of files beside ``FILES`` and films.
         folders: of those that will be needed, by name, whether they are.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     for pattern in (*FILES, *_FILMS, *patterns):
         for old in out.glob(pattern):
             old.unlink()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tdgc.benchmark.evaluation import CONDITIONS, physics_of
 from tdgc.config import CommandRanges
 from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy
@@ -42,9 +43,13 @@ def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Lo
     """Walk ``m`` nominal robots from rest for ``seconds``.
 
     Yields before each control step, so that the caller can set commands and inspect the state.
+
+    Raises:
+        FloatingPointError: a robot's state is not finite.
     """
     config = load_low(low)[1]
-    loco = Locomotion(m, config.robot, config.physics, None, config.gyro)
+    physics = physics_of(config, CONDITIONS["nominal"])
+    loco = Locomotion(m, config.robot, physics, None, config.gyro)
     executor, rows = Executor(loco, low), np.arange(m)
     rng = np.random.default_rng(seed)
     spots = 5.0 * np.stack([rows % 10, rows // 10], axis=1).astype(np.float64)
@@ -53,6 +58,8 @@ def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Lo
         for _ in range(round(seconds / config.physics.control_dt)):
             yield loco
             executor.step(loco.command)
+            if not np.isfinite(loco.world.state.position).all():
+                raise FloatingPointError("a robot's state is not finite: the simulation diverged")
     finally:
         loco.world.close()
 

@@ -212,6 +212,14 @@ class Controller:
         self._graphs = {name: Graph(folder, name, form) for name in GRAPHS}
         self.low, self.high = self._graphs["low"], self._graphs["high"]
         low, high = self.low.table, self.high.table
+        heights = low["robot"]["standing_height"], high["probes"]["plane_below_trunk"]
+        if heights[0] != heights[1] or any(
+            low[k] != high[k] for k in ("joints", "commands", "gaits")
+        ):
+            raise ExportError(
+                f"low and high in '{folder}' are of two exports: their joints, commands, gaits or "
+                "standing height differ; export the pair again"
+            )
         self._order = [(entry["graph"], entry["every"]) for entry in high["order"]]
         self._task, self._probes = high["task"], high["probes"]
         self._stand = np.array(self._task["stand"]["value"])
@@ -287,16 +295,27 @@ class Controller:
         """Run one control step: readings by name, as from ``sense`` -> joint targets, (12,) rad.
 
         Once ``high`` has stopped (``over``), ``low`` gets the interface's commands ``stand``.
+
+        Raises:
+            ExportError: a reading is not finite. The graphs have not run and nothing is remembered
+                of it, because their memories would not be finite from then on.
         """
         task, elapsed = self._task, self.count * self.dt
         if np.linalg.norm(readings["goal"]) < task["goal_radius"]["value"]:
             self._reached_at = self.count if self._reached_at is None else self._reached_at
         over = self.over(self.count, self._reached_at)
+        due = [
+            name
+            for name, every in self._order
+            if self.count % every == 0 and not (name == "high" and over)
+        ]
+        used = {signal["name"] for name in due for signal in self._graphs[name].table["inputs"]}
+        for name in sorted(used & readings.keys()):
+            if not np.isfinite(readings[name]).all():
+                raise ExportError(f"'{name}' is not finite; give the last good reading instead")
         readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
         self.decided, self.seconds = False, 0.0
-        for name, every in self._order:
-            if self.count % every or (name == "high" and over):
-                continue
+        for name in due:
             graph = self._graphs[name]
             taken = {
                 mine: self._graphs[other].values[signal]

@@ -26,8 +26,11 @@ class LinearRate:
     last: float
 
     def __call__(self, remaining: float) -> float:
-        """Learning rate at the remaining share of the run, 1 to 0."""
-        return self.last + remaining * (self.first - self.last)
+        """Learning rate at the remaining share of the run, 1 to 0.
+
+        The last rollout may end beyond the run, where SB3 gives a share below 0.
+        """
+        return self.last + max(remaining, 0.0) * (self.first - self.last)
 
 
 @dataclass

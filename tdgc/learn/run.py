@@ -58,14 +58,17 @@ class Interruption:
 
     def __init__(self, time_limit: float | None) -> None:
         self.reason: str | None = None
+        self._signalled = False
         self._deadline = math.inf if time_limit is None else time.monotonic() + time_limit
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self.reason is not None:  # asked twice: stop at once
+        if self._signalled:  # asked twice: stop at once
             raise KeyboardInterrupt
-        self.reason = signal.Signals(number).name
+        self._signalled = True
+        if self.reason is None:
+            self.reason = signal.Signals(number).name
 
     def due(self) -> bool:
         """Whether the run should stop now."""
@@ -350,15 +353,25 @@ def append_line(path: Path, line: str) -> None:
 def drop_rows_after(steps: int, path: Path) -> None:
     """Drop the rows of a log beyond ``steps``: a resumed run writes them again.
 
+    A row cut short by a crash is the log's last and newer than the checkpoint, so it goes, too.
+
     Raises:
         OSError: the log cannot be written.
     """
     if not path.exists():
         return
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    kept = [line for line in lines if json.loads(line)["steps"] <= steps]
+    lines = path.read_bytes().splitlines(keepends=True)
+    kept = [line for line in lines if _logged_steps(line) <= steps]
     if len(kept) < len(lines):
-        write_text(path, "".join(kept))
+        write_text(path, b"".join(kept).decode())
+
+
+def _logged_steps(line: bytes) -> float:
+    """Steps at which a row was logged; infinite where it cannot be read."""
+    try:
+        return float(json.loads(line)["steps"])
+    except (ValueError, KeyError, TypeError):
+        return math.inf
 
 
 def learn(model: Any, callback: RunCallback, until: int) -> bool:

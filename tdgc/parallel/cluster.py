@@ -104,7 +104,7 @@ def _join(address: str) -> None:
             f"--cluster {address}: no cluster of Ray answers; allowed: host:port, or auto for the "
             "one that RAY_ADDRESS names or that runs on this machine"
         ) from None
-    except RuntimeError as error:
+    except (RuntimeError, ray.exceptions.RayError) as error:  # RayError: a missing token
         reason = " ".join(str(error).split())
         raise ClusterError(f"--cluster {address}: cannot be joined: {reason}") from error
     finally:

@@ -30,14 +30,15 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
         except BaseException:  # the jobs under way are no longer needed
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(mp.active_children()) - others:
-                process.terminate()
+                process.kill()  # it ignores SIGTERM
             raise
 
 
 def _begin() -> None:
     keep_memory()
     end_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    for number in (signal.SIGINT, signal.SIGTERM):  # the parent handles both
+        signal.signal(number, signal.SIG_IGN)
 
 
 class RunJobs(Protocol):

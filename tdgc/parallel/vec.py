@@ -290,7 +290,8 @@ class TaskVecEnv(VecEnv):
         """Continue from the workers' states; where one lacks its episodes, new ones begin.
 
         Raises:
-            ValueError: the states are of another number of workers or robots.
+            ValueError: the states are of another number of workers or robots, or of another
+                configuration.
             WorkerError: a worker failed.
         """
         if len(states) != len(self._links):
@@ -308,9 +309,11 @@ class TaskVecEnv(VecEnv):
                 self._replace(k, restarts)
                 self._receive(k, _START_SECONDS)
             self._links[k].send("load", state)
-        self._receive_all()
+        misfits = self._receive_all()
         if self._broken:
             raise self._broken[min(self._broken)]
+        for misfit in filter(None, misfits):
+            raise ValueError(f"the state does not fit the configuration: {misfit}")
         self._states = [without_episodes(state) for state in states]
 
     def close(self) -> None:

@@ -206,7 +206,7 @@ class Worker:
 
     def answer(self, word: str, argument: Any = None) -> Any:
         """Serve one request: step, restart, forget, load, state or stats."""
-        answer = None
+        answer: Any = None
         if word == "step":
             self._blow_ups += _step(self.task, self._views)
         elif word == "restart":
@@ -215,7 +215,10 @@ class Worker:
         elif word == "forget":
             self.task.forget()
         elif word == "load":
-            _load(self.task, self._views, argument)
+            try:
+                _load(self.task, self._views, argument)
+            except ValueError as error:  # of another configuration
+                answer = str(error)
         elif word == "state":
             answer = {**self.task.state_dict(), "obs": self._views["obs"].copy()}
         elif word == "stats":

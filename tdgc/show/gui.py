@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import Cell, run_cell, tile_of
+from tdgc.benchmark.evaluation import CONDITIONS, Cell, physics_of, run_cell, tile_of
 from tdgc.policies import Policy
 from tdgc.show.film import field_of, set_stage
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, CommandDecoder, default_command, gait_index
@@ -82,7 +82,8 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
     """
     config, tile = load_low(low)[1], tile_of(seed, cell.family, cell.level, cell.first)
     stage, field = set_stage(tile, config.robot, window=True), field_of(tile)
-    loco = Locomotion(1, config.robot, config.physics, field, config.gyro)
+    physics = physics_of(config, CONDITIONS["nominal"])
+    loco = Locomotion(1, config.robot, physics, field, config.gyro)
     executor = Executor(loco, low)
     decoder, start = CommandDecoder(config.commands), default_command()
     for j, name in enumerate(CONTINUOUS):

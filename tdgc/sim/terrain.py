@@ -511,9 +511,10 @@ def height_map(path: str) -> FloatArray:
     if not real or heights.shape != shape or not np.isfinite(heights).all():
         raise InputError(f"terrain '{path}' must hold finite heights in m, an array {shape}")
     limit = HEIGHT_RANGE[1] / MAX_DIFFICULTY
+    heights = heights.astype(np.float64)
     if np.abs(heights).max() > limit:
         raise InputError(f"terrain '{path}' must stay within {limit:g} m of the platforms' height")
-    return heights.astype(np.float64)
+    return heights
 
 
 def family_number(family: str) -> int:

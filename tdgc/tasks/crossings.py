@@ -146,10 +146,11 @@ class Crossings:
 
     # ------------------------------------------------------------------ step by step
 
-    def steer(self, loco: Locomotion, ground: Ground) -> None:
-        """Point the commands of crossing robots at their waypoints, and record arrivals."""
+    def steer(self, loco: Locomotion, ground: Ground, index: NDArray[np.integer]) -> None:
+        """Point the commands of those of the robots ``index`` (n,) that cross at their waypoints,
+        and record arrivals."""
         e, state, command = self._episodes, loco.world.state, loco.command
-        rows = np.flatnonzero(e.crossing)
+        rows = index[e.crossing[index]]
         if not rows.size:
             return
         distance, bearing = to_goal(state, e.waypoint)
@@ -164,11 +165,12 @@ class Crossings:
         command[rows, :2] = velocity[rows]
         for j, wanted in ((_YAW_RATE, turn), (_PITCH, pitch)):
             command[rows, j] = np.clip(wanted, self._low[j], self._high[j])[rows]
-        self._time_leaps(loco)
+        self._time_leaps(loco, rows)
 
-    def _time_leaps(self, loco: Locomotion) -> None:
+    def _time_leaps(self, loco: Locomotion, crossing: NDArray[np.integer]) -> None:
         e, state = self._episodes, loco.world.state
-        rows = np.flatnonzero(e.leaping & (e.elapsed % self._config.leap_decimation == 0))
+        due = e.leaping & (e.elapsed % self._config.leap_decimation == 0)
+        rows = crossing[due[crossing]]
         if rows.size:
             motion = Motion(
                 (state.position[:, 0] - e.origin[:, 0])[rows],

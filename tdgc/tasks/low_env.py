@@ -124,7 +124,7 @@ class LowLevelTask:
         yaw = yaw + np.where(self.episodes.crossing[index], self.episodes.facing[index], 0.0)
         self.locomotion.place(index, xy, yaw, self.rng.uniform(size=len(index)))
         self.ground = measure_ground(self.locomotion)
-        self.crossings.steer(self.locomotion, self.ground)
+        self.crossings.steer(self.locomotion, self.ground, index)
 
     def _draw_places(self, index: NDArray[np.integer]) -> tuple[Array, Array]:
         """Draw where the robots ``index`` (n,) start, (n, 2) m, and their yaw, (n,) rad."""
@@ -201,7 +201,8 @@ class LowLevelTask:
             due = np.flatnonzero((elapsed % self._command_steps == 0) & (elapsed > 0))
             if due.size:
                 self._draw_commands(due)
-        self.crossings.steer(self.locomotion, self.ground)
+        everyone = np.arange(self.num_robots)
+        self.crossings.steer(self.locomotion, self.ground, everyone)
 
     def _left_tile(self) -> NDArray[np.bool_]:
         if self.field is None:

@@ -36,10 +36,12 @@ def check_families(families: Sequence[str]) -> None:
     """Check that tiles of the families can be made.
 
     Raises:
-        ValueError: no family, an unknown name, or a height map that cannot be used.
+        ValueError: no family, an unknown name, a height map that cannot be used, or ``mixed``.
     """
     if not families:
         raise ValueError("'env.families' must name at least one terrain family")
+    if "mixed" in families:
+        raise ValueError("'env.families' must not name 'mixed', which is kept for evaluation")
     for family in families:
         check_family(family, (FLAT,))
 
