@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from tdgc.config import LowLevelConfig
 from tdgc.sim.commands import INDEX
@@ -122,3 +123,35 @@ def test_velocity_ranges_grow_for_a_gait_that_does_well() -> None:
 def test_velocity_ranges_are_whole_outside_training() -> None:
     draw = make(training=False)
     assert draw.share.tolist() == [1.0] * 4 and draw.grown().tolist() == [1.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("poor", "grows"),
+    [
+        ({}, True),
+        ({"track_lin_vel": 0.3}, False),
+        ({"track_yaw_rate": 0.3}, False),
+        ({"match": 0.3}, False),
+    ],
+    ids=["good", "velocity", "yaw rate", "contact"],
+)
+def test_ranges_grow_only_where_all_is_tracked(poor: dict[str, float], grows: bool) -> None:
+    draw = CommandDraw(CONFIG, np.random.default_rng(0), training=True)
+    before, weights = draw.share.copy(), CONFIG.rewards
+    best = {
+        "track_lin_vel": weights.track_lin_vel,
+        "track_yaw_rate": weights.track_yaw_rate,
+        "match": 1.0,
+    }
+    steps = np.full(4, 1e6)
+    sums = {name: steps * value * poor.get(name, 1.0) for name, value in best.items()}
+    draw.judge({"steps": steps} | sums, 4)
+    assert (draw.share > before).all() == grows
+
+
+def test_velocities_and_yaw_rates_are_drawn_from_a_share_of_their_ranges() -> None:
+    draw = CommandDraw(CONFIG, np.random.default_rng(0), training=True)
+    draw.share[:] = 0.25
+    _, values, _ = draw.draw(*draw.bounds(400), np.ones(400, dtype=bool))
+    bounds = np.abs(np.array(dataclasses.astuple(CONFIG.commands))[:3]).max(axis=1)
+    assert (np.abs(values[:, :3]) <= 0.25 * bounds + 1e-9).all()

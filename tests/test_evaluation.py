@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import errno
+import hashlib
 import json
 import math
 import re
@@ -18,12 +19,14 @@ import pytest
 from test_drivers import save_high
 
 import evaluate
-from tdgc.benchmark import evaluation
+from tdgc.benchmark import evaluation, tracking
 from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import (
     BATCH,
     CONDITIONS,
+    Batch,
     Cell,
+    EpisodeLog,
     complete,
     physics_of,
     plan,
@@ -45,9 +48,13 @@ from tdgc.config import (
 from tdgc.errors import InputError
 from tdgc.parallel.worker import WorkerError
 from tdgc.show import gui
+from tdgc.sim.commands import default_command
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
+from tdgc.sim.terrain import EDITION
+from tdgc.sim.world import World
+from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.rules import OUTCOMES
 
@@ -593,3 +600,128 @@ def test_cues_are_a_policy_of_the_script(tmp_path, capsys):
     assert evaluate.main([*flags, "--policies", "cues", "--out", str(tmp_path)]) == 0
     assert [row["policy"] for row in rows_of(tmp_path)] == ["cues"]
     assert "cues, nominal" in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------ what reaches the robots
+
+
+class Stand:
+    """Driver that keeps the default command and notes the steps."""
+
+    def __init__(self):
+        self.steps = []
+
+    def begin(self, loco, *_):
+        self.loco = loco
+
+    def command(self, step):
+        self.steps.append(step)
+        return self.loco.command
+
+
+@pytest.mark.parametrize(
+    ("name", "friction", "payload", "delay", "armature", "motor"),
+    [
+        ("nominal", 0.8, 0.0, 0.0, 0.0, 1.0),
+        ("friction-0.4", 0.4, 0.0, 0.0, 0.0, 1.0),
+        ("payload-3kg", 0.8, 3.0, 0.0, 0.0, 1.0),
+        ("latency-30ms", 0.8, 0.0, 0.03, 0.0, 1.0),
+        ("armature-0.01", 0.8, 0.0, 0.0, 0.01, 1.0),
+        ("motor-0.85", 0.8, 0.0, 0.0, 0.0, 0.85),
+    ],
+)
+def test_a_condition_reaches_the_robots(name, friction, payload, delay, armature, motor):
+    """In Bullet itself, where Bullet can say."""
+    batch = Batch(Cell("gp", name, "rough", 6, 0, 2), LowLevelConfig(), 0)
+    world = batch.loco.world
+    for body, client in zip(world._bodies, world._client_of, strict=True):
+        mass, mu, *_ = client.getDynamicsInfo(body, -1)
+        assert (mass, mu) == pytest.approx((world.state.geometry.trunk_mass + payload, friction))
+    assert world._armature.tolist() == [armature] * 2
+    assert batch.loco.delay.tolist() == [delay] * 2
+    assert world.strength[:, 0].tolist() == [motor] * 2
+    world.close()
+
+
+def test_robots_are_pushed_every_three_seconds(monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 6.2)
+    driver, pushes, push = Stand(), [], World.push
+
+    def note(world, index, velocity):
+        pushes.append((len(driver.steps), np.array(index), np.array(velocity)))
+        push(world, index, velocity)
+
+    monkeypatch.setattr(World, "push", note)
+    cell = Cell("gp", "pushes", "rough", 0, 0, 2)
+    run_cell(cell, load_low(PRETRAINED / "low")[0], driver, 5)
+    drawn = push_velocities(cell, 5, 0.75, 3)
+    assert [steps for steps, *_ in pushes] == [150, 300]  # control steps of 20 ms
+    for k, (_, index, velocity) in enumerate(pushes):
+        np.testing.assert_array_equal(velocity, drawn[index, k])
+
+
+def test_the_sensors_noise_reaches_the_low_policy(monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 0.1)
+    given, make = [], evaluation.Executor
+
+    def note(loco, low, noise):
+        given.append(noise)
+        return make(loco, low, noise)
+
+    monkeypatch.setattr(evaluation, "Executor", note)
+    for name in ("noise", "nominal"):
+        cell = Cell("gp", name, "rough", 6, 0, 2)
+        run_cell(cell, load_low(PRETRAINED / "low")[0], Stand(), 5)
+    assert given[0] is not None and given[1] is None
+
+
+def test_the_path_is_what_was_walked():
+    low, config = load_low(PRETRAINED / "low")
+    batch = Batch(Cell("gp", "nominal", "rough", 0, 0, 2), config, 0)
+    log, executor = EpisodeLog(batch), Executor(batch.loco, low, batch.sensors)
+    command = np.tile(default_command(), (2, 1))
+    command[:, 0] = 0.5
+    places = [batch.loco.world.state.position[:, :2].copy()]
+    for step in range(100):
+        executor.step(command, log.live)
+        log.add(step)
+        places.append(batch.loco.world.state.position[:, :2].copy())
+    batch.loco.world.close()
+    walked = np.linalg.norm(np.diff(places, axis=0), axis=2).sum(axis=0)
+    assert walked.min() > 0.5
+    assert [episode.path_m for episode in log.episodes()] == pytest.approx(walked.tolist())
+
+
+def test_falls_are_counted_once_per_robot(monkeypatch):
+    """The time of a robot ends with its fall."""
+    monkeypatch.setattr(tracking, "_FALL_SECONDS", 0.2)
+    monkeypatch.setattr(tracking, "is_fallen", lambda world: np.array([True, False, False]))
+    found = tracking.count_falls(load_low(PRETRAINED / "low")[0], 3, 0)
+    assert found["falls"] == 1 and found["minutes"] == pytest.approx(2 * 0.2 / 60)
+    assert found["falls_per_10_min"] == pytest.approx(10 / found["minutes"])
+
+
+def test_the_shipped_policy_turns_as_commanded():
+    """A robot that stands still is off by 0.58 rad/s, one that turns the other way by 0.98."""
+    assert track_gait(load_low(PRETRAINED / "low")[0], "trot", 4, 0)["yaw_rate_rmse"] < 0.4
+
+
+#: SHA-256 of the fourth tile of level 8 of ``--seed 0``: heights, start and goal to a micrometre.
+EDITION_2 = {
+    "rough": "710d38a250afa6ce",
+    "pillar": "e5c880703eaaca55",
+    "stair": "11de3079796fec17",
+    "gap": "07f5fd0ad187b330",
+    "tilt": "d0251895101818ba",
+    "mixed": "61b6ae090450f4ff",
+}
+
+
+@pytest.mark.parametrize("family", EDITION_2)
+def test_the_tiles_of_this_edition_never_change(family):
+    """Other tiles would be another benchmark, whose results cannot be compared with these."""
+    assert EDITION == 2
+    tile = tile_of(0, family, 8, 3)
+    values = np.concatenate([tile.heights.ravel(), tile.start, tile.goal]).round(6) + 0.0
+    digest = hashlib.sha256(values.astype("<f8").tobytes()).hexdigest()
+    assert digest.startswith(EDITION_2[family])

@@ -25,7 +25,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import JOINTS, columns, width
 from tdgc.sim.robot import nominal_pose
 from tdgc.sim.terrain import TILE_SIZE, make_tile
-from tdgc.tasks import rewards
+from tdgc.tasks import high_env, rewards
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import (
@@ -36,10 +36,12 @@ from tdgc.tasks.high_observation import (
     high_mirror,
     untold_column,
 )
+from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rewards import HighStep
+from tdgc.tasks.rules import FELL, REACHED
 from tdgc.tasks.teacher import WAY, Skill
 
 LOW = PRETRAINED / "low"
@@ -598,3 +600,116 @@ def test_an_episode_begins_with_the_default_command() -> None:
         assert (task.locomotion.command[0] == 0.5).all()
     finally:
         task.close()
+
+
+# ------------------------------------------------------------------ what a decision is rewarded for
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """The steps that the tasks of a test had rewarded, and the terms of each."""
+    kept, terms = [], rewards.high_terms
+
+    def keep(step, seconds):
+        kept.append((step, terms(step, seconds)))
+        return kept[-1][1]
+
+    monkeypatch.setattr(rewards, "high_terms", keep)
+    return kept
+
+
+def test_the_reward_of_a_decision_is_the_sum_of_its_terms(steps):
+    task = NavigationTask(CONFIG, LOW, 2, seed=3, training=False)
+    task.reset(np.arange(2))
+    for k in (1, 2):
+        reward, *_ = task.step(np.zeros((2, 13)))
+        step, terms = steps[-1]
+        assert len(terms) > 5
+        np.testing.assert_allclose(reward, sum(terms.values()))
+        np.testing.assert_allclose(step.time_share, k / task.horizon)
+    task.close()
+
+
+def test_contact_forces_are_the_largest_within_a_decision(steps):
+    task = NavigationTask(CONFIG, LOW, 1, seed=3, training=False)
+    task.reset(np.arange(1))
+    executed, forces = task._executor.step, iter([0.0, 30.0, 10.0, 0.0, 5.0])
+
+    def execute(commands):
+        executed(commands)
+        task.locomotion.world.state.trunk_force[0] = next(forces)
+
+    task._executor.step = execute
+    task.step(np.zeros((1, 13)))
+    assert steps[0][0].contact_forces[0, 0] == 30.0
+    task.close()
+
+
+def test_base_height_is_above_the_support(steps):
+    hardest = CONFIG.levels - 1
+    config = dataclasses.replace(CONFIG, families=("stair",), first_level=hardest, first_levels=1)
+    task = NavigationTask(config, LOW, 1, seed=3, training=False)
+    task.reset(np.arange(1))
+    loco, middle = task.locomotion, np.array([[4.0, 4.0]])
+    loco.place(np.array([0]), task._origin + middle, np.zeros(1), np.zeros(1))
+    task.step(np.zeros((1, 13)))
+    position = loco.world.state.position
+    assert position[0, 2] > 0.4  # on the stairs
+    support = loco.world.support_height(position[:, 0], position[:, 1])
+    np.testing.assert_allclose(steps[0][0].base_height, position[:, 2] - support)
+    task.close()
+
+
+# ------------------------------------------------------------------ how episodes end and begin
+
+
+def test_a_new_episode_has_not_reached_its_goal():
+    task = NavigationTask(CONFIG, LOW, 2, seed=3, training=False)
+    task.reset(np.arange(2))
+    task.goal[0] = task.locomotion.world.state.position[0, :2]
+    task.step(np.zeros((2, 13)))
+    assert task.reached.tolist() == [True, False]
+    task.reset(np.array([0]))
+    assert not task.reached.any()
+    task.close()
+
+
+def test_a_robot_that_falls_neither_reaches_its_goal_nor_runs_out_of_time(monkeypatch):
+    """Robot 0 falls in the control step after it has reached the goal, robot 1 at the horizon."""
+    task = NavigationTask(CONFIG, LOW, 2, seed=3, training=False)
+    task.reset(np.arange(2))
+    task.elapsed[1] = task.horizon - 1
+    outcomes = iter([np.array([FELL, FELL])] + [np.array([REACHED, FELL])] * 4)
+    monkeypatch.setattr(high_env, "outcome", lambda *_: next(outcomes))
+    _, failed, truncated = task.step(np.zeros((2, 13)))
+    assert failed.all() and not truncated.any() and not task.reached.any()
+    task.close()
+
+
+def test_disturbances_widen_with_the_level():
+    """Twenty robots on the easiest level are nominal and not pushed, twenty on the hardest vary."""
+    task = NavigationTask(CONFIG, LOW, 40, seed=3)
+    task.curriculum.levels[:] = np.repeat([0, CONFIG.levels - 1], 20)
+    task.reset(np.arange(40))
+    loco, speeds = task.locomotion, np.zeros(40)
+    for values in (loco.friction, loco.payload, loco.delay, loco.world.strength[:, 0]):
+        assert np.ptp(values[:20]) == 0.0 and np.ptp(values[20:]) > 0.0
+
+    def push(index, velocity):
+        speeds[index] = np.abs(velocity).max(axis=1)
+
+    loco.world.push = push
+    task._next_push[:] = 0
+    task.step(np.zeros((40, 13)))
+    assert (speeds[:20] == 0.0).all() and (speeds[20:] > 0.0).all()
+    task.close()
+
+
+def test_success_is_the_share_of_episodes_that_reached_the_goal():
+    task = NavigationTask(CONFIG, LOW, 1, seed=3, training=False)
+    task.reset(np.arange(1))
+    task.step(np.zeros((1, 13)))
+    stats = task.take_stats()
+    task.close()
+    stats |= {"family/stair/episodes": 4.0, "family/stair/reached": 1.0}
+    assert summarise(stats)["success/stair"] == 0.25

@@ -192,6 +192,13 @@ def test_reinforcement_learning_goes_on_imitating_as_far_as_it_is_told_to() -> N
     assert errors[0] > 0.07 and errors[1] < 0.03, errors
 
 
+def test_the_critic_learns_the_returns(apprentice) -> None:
+    before = [p.clone() for p in apprentice.policy.value_net.parameters()]
+    apprentice.learn(4 * STEPS * ENVS)
+    after = apprentice.policy.value_net.parameters()
+    assert any(not th.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
 def test_the_teachers_actions_are_not_seen(apprentice, tmp_path) -> None:
     policy = apprentice.policy
     obs = th.randn(ENVS, SEEN + GUIDANCE)

@@ -502,3 +502,16 @@ def test_feet_rise_without_a_policy_only_where_the_pose_carries_the_robot(
     made.world.close()
     apex = np.max(risen[16:], axis=0)
     assert (apex >= lowest).all() and (apex <= highest).all()
+
+
+def test_armature_and_joint_friction_are_drawn() -> None:
+    made, config = standing(40), RandomisationConfig()
+    made.randomise(np.arange(40), config, np.random.default_rng(0))
+    for drawn, (low, high) in (
+        (made.armature, config.armature),
+        (made.world.joint_friction[:, 0], config.joint_friction),
+    ):
+        width = high - low
+        assert low <= drawn.min() < low + 0.1 * width
+        assert high >= drawn.max() > high - 0.1 * width
+    made.world.close()

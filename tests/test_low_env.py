@@ -28,6 +28,7 @@ from tdgc.tasks.leaps import DURATION
 from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask, make_task
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_spaces
 from tdgc.tasks.low_statistics import summarise
+from tdgc.tasks.rewards import CONTACT_FORCE
 from tdgc.tasks.rules import is_fallen
 from tdgc.tasks.tiles import shallow
 
@@ -1017,3 +1018,47 @@ def test_tilts_are_remembered_step_by_step() -> None:
         assert np.ptp(seen, axis=0).max() > 1e-4
     finally:
         task.close()
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_robots_are_randomised_in_training(training: bool) -> None:
+    task = begin(PLANE, 8, training)
+    loco = task.locomotion
+    for drawn in (loco.friction, loco.payload, loco.delay, loco.world.strength):
+        assert (np.ptp(drawn) > 0.0) == training
+    task.close()
+
+
+def test_what_the_terms_of_a_step_are_told() -> None:
+    """On stairs, where heights above the support differ from heights above the start."""
+    task = LowLevelTask(dataclasses.replace(TILES, families=("stair",)), 4, seed=0, training=False)
+    task.level[:] = 9
+    task.reset(np.arange(4))
+    for robot in range(4):
+        put(task, robot, (4.0, 4.0))
+    loco, rng = task.locomotion, np.random.default_rng(0)
+    for _ in range(10):
+        task.step(rng.uniform(-0.3, 0.3, (4, 12)))
+        told, state = task._low_step(still(task)), loco.world.state
+        x, y, z = np.moveaxis(state.foot_position, -1, 0)
+        above = z - loco.world.support_height(x, y)
+        np.testing.assert_allclose(told.foot_height, above, atol=0.03)  # of the foot's lowest point
+        np.testing.assert_array_equal(told.contact, loco.clock.contact)
+        np.testing.assert_array_equal(task.episodes.was_contact, state.foot_force > CONTACT_FORCE)
+    assert (state.position[:, 2] - told.base_height).max() > 0.1
+    task.close()
+
+
+def test_how_robots_cross() -> None:
+    """Walking robots draw their speed, how far they pitch with the slope, and where they face."""
+    task = LowLevelTask(dataclasses.replace(TILES, families=("stair",)), 60, seed=0, training=False)
+    task.reset(np.arange(60))
+    e, c = task.episodes, TILES.crossing
+    rows = e.crossing & ~e.leaping
+    assert rows.sum() > 30
+    (low, high), speed = c.speed, e.speed[rows]
+    assert low <= speed.min() and speed.max() <= high and np.ptp(speed) > 0.6 * (high - low)
+    assert e.follow[rows].min() < 0.2 and e.follow[rows].max() > 0.8
+    ahead = (e.facing[rows] == 0.0).mean()
+    assert abs(ahead - c.facing) < 0.2 and 0.0 < ahead < 1.0
+    task.close()

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import dataclasses
 import json
+import math
 import multiprocessing
 import os
 import random
@@ -15,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,10 +42,12 @@ from tdgc.config import (
 )
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import add_arguments, configure
-from tdgc.learn.ppo import LinearRate
+from tdgc.learn.imitation import TaughtPolicy
+from tdgc.learn.ppo import LinearRate, NoiseScaledRate
 from tdgc.learn.run import Interruption, append_line, drop_rows_after, tensorboard_logger
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
+from tdgc.parallel.worker import ProcessLink
 from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import actor_layout
@@ -858,3 +862,65 @@ def test_robots_of_a_run() -> None:
     assert on_tiles.physics.joint_steps == 4
     assert dataclasses.replace(on_plane, terrain="tiles", physics=on_tiles.physics) == on_tiles
     assert PPOConfig().mirror
+
+
+# ------------------------------------------------------------------ how the learners are built
+
+
+def test_the_learning_rate_is_scaled_by_the_noise() -> None:
+    rate = NoiseScaledRate(first=2e-3, last=1e-3, initial_std=0.5)
+    assert rate(1.0) == pytest.approx(1e-3)
+    rate.log_std = th.log(th.tensor([0.1, 0.3]))
+    assert rate(0.0) == pytest.approx(2e-4)
+
+
+def test_a_high_policy_starts_by_walking_with_noise_on_its_gaits() -> None:
+    config = HighTrainConfig()
+    policy = SimpleNamespace(action_net=th.nn.Linear(4, 13), log_std=th.zeros(13))
+    train_high.start_walking(policy, config)  # type: ignore[arg-type]
+    start = train_high.start_action(config)
+    np.testing.assert_allclose(policy.action_net.bias.detach(), start, rtol=1e-6)
+    assert policy.log_std[-1].item() == pytest.approx(math.log(config.ppo.initial_gait_std))
+    assert (policy.log_std[:-1] == 0.0).all()
+
+
+def test_the_learner_is_given_the_imitation_loss_and_the_exchange(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: dict[str, Any] = {}
+
+    def learner(policy: type, env: None, **keywords: Any) -> SimpleNamespace:
+        made.update(keywords, policy=policy)
+        return SimpleNamespace(policy=SimpleNamespace())
+
+    monkeypatch.setattr(train_high, "FastRecurrentPPO", learner)
+    monkeypatch.setattr(train_high, "make_env", lambda *_: None)
+    monkeypatch.setattr(train_high, "start_walking", lambda *_: None)
+    config = HighTrainConfig()
+    ppo = dataclasses.replace(config.ppo, imitation_coef=0.2, memory_exchange=0.3)
+    config = dataclasses.replace(config, ppo=ppo)
+    low = policies.load(PRETRAINED / "low")
+    model, _ = train_high.build_reinforcement(config, low, "cpu", 1.0, ProcessLink)
+    assert made["policy"] is TaughtPolicy and made["exchange"].share == 0.3
+    assert model.policy.imitation_weight == pytest.approx(0.2 / config.ppo.ent_coef)
+
+
+def test_the_noise_of_a_symmetric_policy_is_symmetric(tmp_path: Path) -> None:
+    """In training and from the file, whatever the parameters of the noise are."""
+    config = LowTrainConfig().env
+    mirror, size = low_mirror(config), width(actor_layout(config.robot, config.gyro))
+    policy = AsymmetricActorCriticPolicy(
+        *low_spaces(config), lambda _: 1e-3, actor_dim=size, mirror=mirror, net_arch=[8]
+    )
+    with th.no_grad():
+        policy.log_std.copy_(th.linspace(-4.0, 0.0, 12))
+    other = list(mirror.action_index)
+    std = policy.symmetric_log_std().detach().numpy()
+    assert np.ptp(std) > 0.5
+    np.testing.assert_allclose(std, std[other])
+    policies.save(tmp_path / "policy", policy, {})
+    loaded = policies.load(tmp_path / "policy")
+    loaded.seed(0)
+    drawn, _ = loaded.predict(np.zeros((20000, size), dtype=np.float32), deterministic=False)
+    spread = drawn.std(axis=0)
+    np.testing.assert_allclose(spread, spread[other], rtol=0.05)

@@ -665,3 +665,28 @@ def test_bullet_time_is_counted_and_clients_are_closed() -> None:
     assert len(ids) == 2 and all(pybullet.isConnected(i) for i in ids)
     world.close()
     assert not any(pybullet.isConnected(i) for i in ids)
+
+
+def test_the_trunks_force_is_its_largest_within_a_control_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In eight physics steps the trunk is hit in the second, third and sixth."""
+    pose = nominal_pose(RobotConfig())
+    world = World(1, RobotConfig(), PhysicsConfig(substeps=8, hold=1))
+    upright = np.array([[0.0, 0.0, 0.0, 1.0]])
+    world.reset_robots([0], np.array([[0.0, 0.0, 1.0]]), upright, pose[None])
+    client, body = world._clients[0], world._bodies[0]
+    forces, contacts = iter([0.0, 90.0, 20.0, 0.0, 0.0, 5.0, 0.0, 0.0]), client.getContactPoints
+    hit = [0.0]
+
+    def touched(**of: int) -> list[tuple[int, ...]]:
+        if of.get("linkIndexB") != -1 or "bodyA" not in of:
+            return contacts(**of)
+        hit[0] = next(forces)
+        return [(0, client.ground, body, -1, -1)]
+
+    client.getContactPoints = touched
+    monkeypatch.setattr(World, "_force", lambda *_: hit[0])
+    world.step(np.tile(pose, (3, 1, 1)), np.zeros(1), np.zeros((1, 12)))
+    assert world.state.trunk_force[0] == 90.0
+    world.close()
