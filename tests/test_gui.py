@@ -53,6 +53,7 @@ def test_no_display(
     monkeypatch.setenv("DISPLAY", display)
     with pytest.raises(WindowError):
         check_display()
-    assert evaluate.main(["--gui", mode, "--policies", "gp"]) == 2
+    driver = ["--policies", "gp"] if mode == "watch" else []
+    assert evaluate.main(["--gui", mode, *driver]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("evaluate.py: Bullet's window needs ")
