@@ -61,6 +61,16 @@ class Graph:
         """Begin a new episode."""
         self.memory, self.values, self.seconds = dict(self._start), dict[str, Array](), 0.0
 
+    def check(self, values: dict[str, Array]) -> None:
+        """Check that the inputs among ``values`` are finite.
+
+        Raises:
+            ExportError: one is not; ``memory`` would not be finite from then on.
+        """
+        for name in self._inputs:
+            if name in values and not np.isfinite(values[name]).all():
+                raise ExportError(f"'{name}' is not finite; give the last good reading instead")
+
     def __call__(self, values: dict[str, Array]) -> dict[str, Array]:
         """Run one step, inputs by name -> outputs by name; ignore other entries of ``values``.
 
@@ -297,8 +307,7 @@ class Controller:
         Once ``high`` has stopped (``over``), ``low`` gets the interface's commands ``stand``.
 
         Raises:
-            ExportError: a reading is not finite. The graphs have not run and nothing is remembered
-                of it, because their memories would not be finite from then on.
+            ExportError: a reading is not finite. The graphs have not run, and remember nothing.
         """
         task, elapsed = self._task, self.count * self.dt
         if np.linalg.norm(readings["goal"]) < task["goal_radius"]["value"]:
@@ -309,10 +318,8 @@ class Controller:
             for name, every in self._order
             if self.count % every == 0 and not (name == "high" and over)
         ]
-        used = {signal["name"] for name in due for signal in self._graphs[name].table["inputs"]}
-        for name in sorted(used & readings.keys()):
-            if not np.isfinite(readings[name]).all():
-                raise ExportError(f"'{name}' is not finite; give the last good reading instead")
+        for name in due:
+            self._graphs[name].check(readings)
         readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
         self.decided, self.seconds = False, 0.0
         for name in due:

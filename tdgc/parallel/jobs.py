@@ -1,13 +1,18 @@
 """Independent jobs, such as batches of episodes, shared among processes on this machine."""
 
 import multiprocessing as mp
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Protocol, TypeVar
 
-from tdgc.parallel.worker import WorkerError, end_with_parent, keep_memory, one_blas_thread
+from tdgc.parallel.worker import (
+    WorkerError,
+    end_with_parent,
+    keep_memory,
+    leave_signals_to_parent,
+    one_blas_thread,
+)
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -37,8 +42,7 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
 def _begin() -> None:
     keep_memory()
     end_with_parent()
-    for number in (signal.SIGINT, signal.SIGTERM):  # the parent handles both
-        signal.signal(number, signal.SIG_IGN)
+    leave_signals_to_parent()
 
 
 class RunJobs(Protocol):

@@ -255,11 +255,15 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _serve(pipe: Connection, arrays: Arrays, beginning: Beginning) -> None:
-    """Run a worker: send its state, then answer one request at a time until ``close``."""
-    # The parent handles the signals that a terminal or a batch system sends to all processes.
+def leave_signals_to_parent() -> None:
+    """Ignore the signals that a terminal or a batch system sends to all processes."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+
+
+def _serve(pipe: Connection, arrays: Arrays, beginning: Beginning) -> None:
+    """Run a worker: send its state, then answer one request at a time until ``close``."""
+    leave_signals_to_parent()
     end_with_parent()
     worker: Worker | None = None
     try:
