@@ -155,7 +155,7 @@ class Evaluation:
             if self.cluster is not None:
                 raise ValueError("--gui shows a robot of this machine: no --cluster")
             if self.filmed or self.traced is not None:
-                raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
+                raise ValueError("--gui only shows the robot: no --tracking, --trace or --video")
         if self.mode == "drive" and self.tuning is not None:
             raise ValueError("--gui drive is of the low policy alone: no --tune or --set")
         if self.mode == "tracking":
@@ -175,7 +175,7 @@ class Evaluation:
             OSError: a file that cannot be read.
         """
         if flags.gui is not None and flags.tracking:
-            raise ValueError("--gui is only to be looked at: no --tracking, --trace or --video")
+            raise ValueError("--gui only shows the robot: no --tracking, --trace or --video")
         if flags.gui == "drive" and (flags.policies is not None or flags.high is not None):
             raise ValueError("--gui drive is of the low policy alone: no --policies or --high")
         if flags.gui is not None and flags.conditions is not None:
@@ -306,11 +306,11 @@ def run_one(
 ) -> Ran:
     """Run a batch. It writes no files, because it may run on another machine."""
     driver = drivers[cell.policy]
-    recorder = Recorder(driver, seed, filmed)
+    recorder = Recorder(driver, filmed)
     if traced is None:
         episodes = run_cell(cell, low, driver, seed, [recorder])
         return Ran(episodes, recorder.recordings(), [], [])
-    tracer = Tracer(driver, seed)
+    tracer = Tracer(driver)
     episodes = run_cell(cell, low, driver, seed, [tracer, recorder])
     traces, hips = tracer.traces(), float(read_geometry(load_low(low)[1].robot).hips[0, 0])
     return Ran(

@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -31,7 +32,7 @@ from tdgc.config import (
 from tdgc.files import checksum
 from tdgc.learn.flags import add_arguments, configure, worker_link
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
-from tdgc.learn.ppo import LinearRate, shared_keywords
+from tdgc.learn.ppo import LinearRate, check_batch, shared_keywords
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, MemoryExchange
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
@@ -51,6 +52,7 @@ from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.manners import find_manner, manner_of
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
+from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.teacher import Skill
 from tdgc.tasks.tiles import check_families, check_levels
 
@@ -71,9 +73,22 @@ def find_low() -> str:
         if "calibration" in policies.load(TRAINED_LOW).meta:
             return str(TRAINED_LOW)
         tqdm.write(
-            f"{TRAINED_LOW} is not final, its run has not come to its end; --low takes it anyway"
+            f"{TRAINED_LOW} comes from an unfinished run, so the shipped low policy is used; "
+            "--low selects it anyway"
         )
     return str(PRETRAINED / "low")
+
+
+def with_low(config: HighTrainConfig, assignments: Sequence[str]) -> HighTrainConfig:
+    """Add the low policy and its command ranges, so that ``assignments`` may narrow one of them.
+
+    Raises:
+        ValueError: a low policy that cannot be used.
+    """
+    chosen = [text for text in assignments if text.partition("=")[0].strip() == "low"]
+    low = with_overrides(config, chosen).low or find_low()
+    env = dataclasses.replace(config.env, commands=load_low(low)[1].commands)
+    return dataclasses.replace(config, low=low, env=env)
 
 
 def pin_low(config: HighTrainConfig) -> HighTrainConfig:
@@ -123,7 +138,7 @@ def start_action(config: HighTrainConfig) -> Array:
     try:
         return decoder.encode(command)
     except ValueError as error:
-        raise ConfigError(f"'start_speed' or 'start_swing' cannot be walked: {error}") from None
+        raise ConfigError(f"'start_speed' or 'start_swing' is out of bounds: {error}") from None
 
 
 def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
@@ -268,8 +283,9 @@ def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
     ]
 
 
-def check(config: HighTrainConfig) -> None:
-    """Refuse settings that would fail later or have no effect.
+def check(config: HighTrainConfig, control_dt: float) -> None:
+    """Refuse settings that would fail later or have no effect; ``control_dt`` s is the low
+    policy's control step.
 
     Raises:
         ValueError: names the setting and what is allowed.
@@ -298,13 +314,16 @@ def check(config: HighTrainConfig) -> None:
                 f"'{name}.minibatches' must be at most the {config.n_envs} robots, "
                 f"not {minibatches}"
             )
+        steps = ppo.n_steps * config.n_envs // minibatches
+        check_batch(f"ppo.n_steps' times 'n_envs' per '{name}.minibatches", steps)
+    episode_steps(env.episode_seconds, env.decimation * control_dt)
     if not ppo.ent_coef:  # SB3 multiplies both terms by it
         for name, used in (("gait_ent_coef", True), ("imitation_coef", config.imitation.steps)):
             if used and getattr(ppo, name):
-                raise ConfigError(f"'ppo.{name}' needs an 'ppo.ent_coef' above 0; or set it to 0")
+                raise ConfigError(f"'ppo.{name}' needs 'ppo.ent_coef' above 0; or set it to 0")
     if ppo.encoder and ppo.lstm is None:
         raise ConfigError(
-            "'ppo.encoder' must be [] where 'ppo.lstm' is null: it stands before LSTMs"
+            "'ppo.encoder' must be [] if 'ppo.lstm' is null: its layers precede the LSTMs"
         )
     if ppo.mirror:
         high_mirror(env)
@@ -335,14 +354,14 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if args.resume and (args.no_teacher or PRESETS[args.preset]):
             raise ConfigError("--resume keeps the run's settings: no --preset or --no-teacher")
-        config = configure(with_overrides(HighTrainConfig(), preset), args)
-        config = dataclasses.replace(config, low=config.low or find_low())
+        start = with_overrides(HighTrainConfig(), preset)
+        config = configure(start if args.resume else with_low(start, args.assignments), args)
         low, low_config = load_low(cast(str, config.low))
         config = pin_low(config)
         tqdm.write(f"low policy: {config.low}")
         check_robot(low_config.robot, low_config.physics, config.env.randomisation)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
-        check(config)
+        check(config, low_config.physics.control_dt)
         interruption = Interruption(args.time_limit)
         config = with_manner(config, low, args.init)
         meta: dict[str, Any] = {
@@ -359,15 +378,15 @@ def main(arguments: list[str] | None = None) -> int:
             worker_link(args), args.init,
         )  # fmt: skip
         run.train(phases(config, low, args.device), args.resume)
+        log = args.out / "log.jsonl"
+        if log.exists():
+            plots.decision_curve(log, args.out / "training.png")
     except ValueError as error:
         print(f"train_high.py: {error}", file=sys.stderr)
         return 2
     except (WorkerError, OSError) as error:
         print(f"train_high.py: {error}", file=sys.stderr)
         return 1
-    log = args.out / "log.jsonl"
-    if log.exists():
-        plots.decision_curve(log, args.out / "training.png")
     return 0
 
 

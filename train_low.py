@@ -30,7 +30,7 @@ from tdgc.config import (
 )
 from tdgc.errors import StoppedError
 from tdgc.learn.flags import add_arguments, configure, worker_link
-from tdgc.learn.ppo import NoiseScaledRate, shared_keywords
+from tdgc.learn.ppo import NoiseScaledRate, check_batch, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import TaskVecEnv
@@ -44,6 +44,7 @@ from tdgc.sim.terrain import EDITION
 from tdgc.tasks.low_env import make_task
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 from tdgc.tasks.low_statistics import summarise
+from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.tiles import check_families, check_levels
 
 
@@ -73,8 +74,9 @@ def check(config: LowTrainConfig) -> None:
     """
     if config.env.terrain != LowLevelConfig.terrain:
         raise ConfigError("'env.terrain' has no effect: robots train on both, see plane_share")
-    if config.ppo.batch_size < 2:
-        raise ConfigError(f"'ppo.batch_size' must be at least 2, not {config.ppo.batch_size}")
+    check_batch("ppo.batch_size", config.ppo.batch_size)
+    check_batch("ppo.n_steps' times 'n_envs", config.ppo.n_steps * config.n_envs)
+    episode_steps(config.env.episode_seconds, config.env.physics.control_dt)
     if 0 < config.calibration.robots < LEAST_ROBOTS:
         raise ConfigError(
             f"'calibration.robots' must be 0 or at least {LEAST_ROBOTS}, "
@@ -82,6 +84,11 @@ def check(config: LowTrainConfig) -> None:
         )
     check_families(config.env.families)
     check_levels(config.env.levels)
+    if config.env.first_levels > config.env.levels:
+        raise ConfigError(
+            f"'env.first_levels' must be at most the {config.env.levels} levels, "
+            f"not {config.env.first_levels}"
+        )
     check_robot(config.env.robot, config.env.physics, config.env.randomisation)
 
 
@@ -211,15 +218,15 @@ def main(arguments: list[str] | None = None) -> int:
         )  # fmt: skip
         if run.train(phases(config, args.device), args.resume):
             finish(args.out, config, interruption)
+        log = args.out / "log.jsonl"
+        if log.exists():
+            plots.training_curve(log, args.out / "training.png")
     except ValueError as error:
         print(f"train_low.py: {error}", file=sys.stderr)
         return 2
     except (WorkerError, OSError) as error:
         print(f"train_low.py: {error}", file=sys.stderr)
         return 1
-    log = args.out / "log.jsonl"
-    if log.exists():
-        plots.training_curve(log, args.out / "training.png")
     return 0
 
 

@@ -427,8 +427,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"tdgc.calibration: {error}", file=sys.stderr)
         return 1
     print(
-        f"{facts['walked']:.0f} of {args.robots} robots walked; what a command leads to is known "
-        f"to {facts['error_vx_m_s']:.3f} and {facts['error_vy_m_s']:.3f} m/s and "
+        f"{facts['walked']:.0f} of {args.robots} robots walked; the fit predicts what commands "
+        f"lead to within {facts['error_vx_m_s']:.3f} and {facts['error_vy_m_s']:.3f} m/s and "
         f"{facts['error_yaw_rate_rad_s']:.3f} rad/s; difference in actions "
         f"{facts['action_difference_before']:.3f} before and "
         f"{facts['action_difference_after']:.3f} after learning"

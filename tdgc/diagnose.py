@@ -59,8 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
     ]
     if differ:
         print(
-            f"tdgc.diagnose: not what the graphs give: {'; '.join(differ)}: a value was not handed "
-            "on or not logged as it was, or the graphs are other ones",
+            f"tdgc.diagnose: not what the graphs give: {'; '.join(differ)}: a value was not passed "
+            "on or not logged as it was, or these are not the graphs that ran",
             file=sys.stderr,
         )
         return 1

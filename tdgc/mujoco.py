@@ -129,7 +129,7 @@ def run_episode(
     episode = EpisodeLog(batch)
     pair.begin(batch.loco, batch.goal, batch.told)
     for watcher in watchers:
-        watcher.begin(cell, batch.loco, batch.field, batch.goal)
+        watcher.begin(batch)
     closed_loop(pair, pair, batch, episode, watchers)
     if pair.log is not None:
         pair.log.end(pair.readings())
@@ -153,7 +153,7 @@ def run_cell(
     for number in range(cell.first, cell.first + cell.count):
         one = Cell(cell.policy, cell.condition, cell.family, cell.level, number, 1)
         pair = Deployed(controller, LogWriter(controller) if number < logged else None)
-        recorder = Recorder(pair, seed, filmed)
+        recorder = Recorder(pair, filmed)
         episode = run_episode(one, pair, config, seed, [recorder])
         episodes.append(episode)
         recordings += recorder.recordings()
@@ -262,7 +262,7 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
         raise ValueError(f"--log must lie in [0, --episodes], not {args.log}")
     for flag, value in (("--video", args.video), ("--log", args.log)):
         if args.gui and value:
-            raise ValueError(f"--gui is only to be looked at: no {flag}")
+            raise ValueError(f"--gui only shows the robot: no {flag}")
     config = with_overrides(MujocoConfig(), args.assignments)
     for key in ("armature", "joint_friction"):
         if getattr(args, key) is not None:

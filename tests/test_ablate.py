@@ -292,7 +292,7 @@ def test_without_an_uncalibrated_policy_its_variants_are_left_out(
     assert "uncalibrated" not in names and "gp-uncalibrated" not in names
     assert len(names) == len(VARIANTS) - 2
     said = capsys.readouterr().out
-    assert said.startswith("without uncalibrated and gp-uncalibrated: there is no '")
+    assert said.startswith("uncalibrated and gp-uncalibrated left out: there is no '")
     (tmp_path / "uncalibrated.json").touch()
     assert without_missing(VARIANTS, tmp_path / "policy") == list(VARIANTS)
 

@@ -18,6 +18,7 @@ from tdgc.sim.observation import width
 from tdgc.sim.robot import Array, action_scale
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import low_mirror, low_spaces
+from tdgc.tasks.pairing import PRETRAINED
 
 RANGES = CommandRanges()
 MIDDLE, HALF = np.array([0.1, 0.0, 0.0]), np.array([1.1, 0.6, 1.0])  # of the velocity ranges
@@ -138,6 +139,15 @@ def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None
     assert (twice[0] == given).all() and (twice[1] == reached).all()
 
 
+def test_measured_velocities_are_those_that_robots_walk_at() -> None:
+    """Within its ranges the shipped policy, which is calibrated, nearly does what it is told."""
+    given, reached = measure(policies.load(PRETRAINED / "low"), 24, seed=5)
+    inside = (np.abs(given[:, :3] - MIDDLE) <= HALF).all(axis=1)
+    for axis in (0, 2):
+        asked = given[inside, axis]
+        assert 0.7 < asked @ reached[inside, axis] / (asked @ asked) < 1.3
+
+
 # ------------------------------------------------------------------ the copy
 
 
@@ -242,7 +252,7 @@ def test_script(
     assert calibration.main([*arguments, *small]) == 0
     said = capsys.readouterr()
     assert said.err == "" and said.out.count("\n") == 1
-    assert " of 64 robots walked; what a command leads to is known to " in said.out
+    assert " of 64 robots walked; the fit predicts what commands lead to within " in said.out
     copy = policies.load(tmp_path / "out" / "copy")
     assert copy.meta["config"] == low.meta["config"] and copy.meta["steps"] == 7
     assert copy.meta["calibration"]["seed"] == 42

@@ -52,11 +52,15 @@ def test_what_was_recorded_must_be_whole() -> None:
     data = to_dict(config)
     assert recorded(LowTrainConfig, data, "run") == config
     del data["env"]["robot"]["swing_ramp"]
-    message = "^run: no key 'env.robot.swing_ramp', by default 1.0; say what it was$"
+    message = (
+        r"^run: the key 'env\.robot\.swing_ramp' is missing \(default 1\.0\); "
+        "add the value that it was trained with$"
+    )
     with pytest.raises(ConfigError, match=message):
         recorded(LowTrainConfig, data, "run")
     del data["env"]["robot"]
-    with pytest.raises(ConfigError, match=r"no key 'env\.robot\.urdf', by default \"urdf/quadr"):
+    message = r"key 'env\.robot\.urdf' is missing \(default \"urdf/quadr"
+    with pytest.raises(ConfigError, match=message):
         recorded(LowTrainConfig, data, "run")
 
 

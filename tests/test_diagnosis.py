@@ -224,7 +224,7 @@ def test_who_walks_blindly_into_a_trench_made_no_decision():
 
 def test_the_baseline_is_not_blamed_on_the_low_level_in_gap(low):
     driver = BaselineDriver()
-    tracer = Tracer(driver, planted.SEED)
+    tracer = Tracer(driver)
     run_cell(Cell("gp", "nominal", "gap", 8, 0, 3), low[0], driver, planted.SEED, [tracer])
     failures = [diagnose(t, HIPS) for t in tracer.traces() if t.outcome != "reached"]
     assert len(failures) >= 2
@@ -233,7 +233,7 @@ def test_the_baseline_is_not_blamed_on_the_low_level_in_gap(low):
 
 def test_the_teacher_is_not_blind(low):
     driver = TeacherDriver(low[1], Skill(Landing()))
-    tracer = Tracer(driver, planted.SEED)
+    tracer = Tracer(driver)
     run_cell(Cell("teacher", "nominal", "gap", 4, 0, 1), low[0], driver, planted.SEED, [tracer])
     (trace,) = tracer.traces()
     assert set(trace["family"]) == {"gap"} and has_looked(trace)
@@ -375,5 +375,5 @@ def test_summary_says_where_most_is_to_be_won():
     assert lines[0] == "failures of tdgc, nominal: 6 of 10 episodes"
     assert lines[2].split() == "stair 6 1 3 0 lost its footing on the way to the goal (3)".split()
     assert lines[3].split() == "rough 6 2 0 0 steered off the tile (2)".split()
-    assert lines[4] == "most is to be won in stair, by execution: 30.0 points of success"
+    assert lines[4] == "largest possible gain: stair, execution, 30.0 points of success"
     assert lines[5:] == ["failures of gp, nominal: 0 of 1 episodes"]

@@ -18,17 +18,14 @@ from stubs import in_this_process
 import evaluate
 from tdgc.benchmark import evaluation
 from tdgc.benchmark.drivers import BaselineDriver
-from tdgc.benchmark.evaluation import Cell, run_cell, tile_of
+from tdgc.benchmark.evaluation import Batch, Cell, run_cell, tile_of
 from tdgc.benchmark.recording import Recorder, Recording, runs_of_equal, spans
 from tdgc.config import CommandRanges, RobotConfig
 from tdgc.show import film, plots
 from tdgc.sim.commands import default_command
 from tdgc.sim.gaits import gait_embedding
-from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, nominal_pose
-from tdgc.sim.terrain import TileField
 from tdgc.tasks.pairing import PRETRAINED, load_low
-from tdgc.tasks.rewards import CONTACT_FORCE
 
 
 def planted(steps: int = 25, policy: str = "gp", **changes: Any) -> Recording:
@@ -70,8 +67,8 @@ class Notes:
     def __init__(self) -> None:
         self.rows: list[dict[str, Array]] = []
 
-    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
-        self._loco, self._origin = loco, field.origin(1, 0)
+    def begin(self, batch: Batch) -> None:
+        self._loco, self._origin = batch.loco, batch.field.origin(1, 0)
 
     def step(self, step: int, live: Array, outcome: Array) -> None:
         state = self._loco.world.state
@@ -81,7 +78,7 @@ class Notes:
                     "position": state.position[1] - [*self._origin, 0.0],
                     "q": state.q[1].copy(),
                     "command": self._loco.command[1].copy(),
-                    "contact": state.foot_force[1] > CONTACT_FORCE,
+                    "contact": state.foot_force[1] > 1.0,
                 }
             )
 
@@ -90,7 +87,7 @@ def test_a_recording_is_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     """It equals what another watcher sees, and recording does not change the episode."""
     monkeypatch.setattr(evaluation, "HORIZON", 0.4)
     low, driver = load_low(PRETRAINED / "low")[0], BaselineDriver()
-    cell, notes, recorder = Cell("gp", "nominal", "rough", 9, 0, 3), Notes(), Recorder(driver, 5, 2)
+    cell, notes, recorder = Cell("gp", "nominal", "rough", 9, 0, 3), Notes(), Recorder(driver, 2)
     watched = run_cell(cell, low, driver, 5, [notes, recorder])
     alone = run_cell(cell, low, BaselineDriver(), 5)
     assert [e.row() for e in watched] == [e.row() for e in alone]
@@ -111,7 +108,7 @@ def test_only_the_first_episodes_are_recorded(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(evaluation, "HORIZON", 0.04)
     low, driver = load_low(PRETRAINED / "low")[0], BaselineDriver()
     for first, count, numbers in ((0, 1, [0]), (1, 3, [1, 2]), (1, 1, [])):
-        recorder = Recorder(driver, 0, count)
+        recorder = Recorder(driver, count)
         run_cell(Cell("gp", "nominal", "rough", 0, first, 2), low, driver, 0, [recorder])
         assert [r.episode for r in recorder.recordings()] == numbers
 
@@ -345,7 +342,7 @@ def test_without_an_encoder_all_but_mp4_is_written(
         (["--video", "3", "--episodes", "2"], "--video must lie in [0, --episodes], not 3"),
         (["--video", "-1"], "--video must lie in [0, --episodes], not -1"),
         (["--video", "--tracking"], "--tracking has no episodes to film: no --video"),
-        (["--gui", "--video"], "--gui is only to be looked at: no --tracking, --trace or --video"),
+        (["--gui", "--video"], "--gui only shows the robot: no --tracking, --trace or --video"),
     ],
 )
 def test_flags_that_cannot_be_used(

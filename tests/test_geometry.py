@@ -29,7 +29,7 @@ from tdgc.sim.robot import (
 )
 from tdgc.sim.urdf import JOINTS, merged_file, read_urdf, urdf_path
 from tdgc.sim.world import World
-from tdgc.tasks import rewards
+from tdgc.tasks import low_rewards as rewards
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.pairing import PRETRAINED
 

@@ -25,7 +25,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import JOINTS, columns, width
 from tdgc.sim.robot import nominal_pose
 from tdgc.sim.terrain import TILE_SIZE, make_tile
-from tdgc.tasks import high_env, rewards
+from tdgc.tasks import high_env, high_rewards
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import (
@@ -36,11 +36,11 @@ from tdgc.tasks.high_observation import (
     high_mirror,
     untold_column,
 )
+from tdgc.tasks.high_rewards import HighStep
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
-from tdgc.tasks.rewards import HighStep
 from tdgc.tasks.rules import FELL, REACHED
 from tdgc.tasks.teacher import WAY, Skill
 
@@ -79,17 +79,17 @@ def step_of(**changes) -> HighStep:
 
 
 def test_weights_are_scaled_by_the_steps_duration():
-    terms = rewards.high_terms(step_of(), dt=0.1)
+    terms = high_rewards.high_terms(step_of(), dt=0.1)
     assert terms["alive"][0] == pytest.approx(0.1 * HighRewardConfig().alive)
     assert terms["laziness"][0] == pytest.approx(0.1 * HighRewardConfig().laziness)
     off = step_of(config=dataclasses.replace(HighRewardConfig(), face=0.0))
-    assert "face" not in rewards.high_terms(off, dt=0.1)
+    assert "face" not in high_rewards.high_terms(off, dt=0.1)
 
 
 def test_without_step_time_scaling_weights_are_per_decision():
     config = dataclasses.replace(HighRewardConfig(), step_time_scaling=False)
     for dt in (0.02, 0.1):
-        terms = rewards.high_terms(step_of(config=config), dt)
+        terms = high_rewards.high_terms(step_of(config=config), dt)
         assert terms["alive"][0] == 0.1 and terms["laziness"][0] == -0.5
 
 
@@ -105,7 +105,7 @@ def worth(rewards_config: HighRewardConfig, falls: float) -> tuple[float, float]
         seen = step_of(
             distance=np.array([distance]), lin_vel=np.full((1, 3), 0.3), config=rewards_config
         )
-        return float(sum(term[0] for term in rewards.high_terms(seen, 0.1).values()))
+        return float(sum(term[0] for term in high_rewards.high_terms(seen, 0.1).values()))
 
     gamma, start, near, decisions = 0.99, 6.5, 0.7, 116
     survive = gamma * np.exp(-0.1 * falls)
@@ -176,8 +176,8 @@ def test_mirrored_robots_see_mirrored_things(cues):
     index, flip = JOINTS
     state.q[:] = [NOMINAL + angles, NOMINAL + angles[list(index)] * flip]
     state.derive()
-    task._actions[0] = rng.uniform(-1.0, 1.0, 13)
-    task._actions[0, 1] *= mirror.action_sign
+    task.rewards.actions[0] = rng.uniform(-1.0, 1.0, 13)
+    task.rewards.actions[0, 1] *= mirror.action_sign
     task._observer.begin(np.arange(2), task.goal)
     seen, other = task.observe()
     np.testing.assert_allclose(
@@ -462,8 +462,8 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
             commands = task.teacher.commands(task.locomotion, task.goal)
             np.testing.assert_allclose(task.decoder.decode(taught), commands, atol=1e-6)
             _, terminated, truncated = task.step(np.full((40, 13), 0.25))
-            np.testing.assert_allclose(task._actions[0][leads], taught[leads], atol=1e-6)
-            assert (task._actions[0][~leads] == 0.25).all()
+            np.testing.assert_allclose(task.rewards.actions[0][leads], taught[leads], atol=1e-6)
+            assert (task.rewards.actions[0][~leads] == 0.25).all()
             task.reset(np.flatnonzero(terminated | truncated))
         assert led[0] == led[1] == 1.0  # after episodes of two decisions, the share is 2/3, 1/3, 0
         assert 0.45 < led[2] < 0.9 and 0.1 < led[4] < 0.55 and led[6] == led[7] == 0.0
@@ -608,13 +608,13 @@ def test_an_episode_begins_with_the_default_command() -> None:
 @pytest.fixture
 def steps(monkeypatch):
     """The steps that the tasks of a test had rewarded, and the terms of each."""
-    kept, terms = [], rewards.high_terms
+    kept, terms = [], high_rewards.high_terms
 
     def keep(step, seconds):
         kept.append((step, terms(step, seconds)))
         return kept[-1][1]
 
-    monkeypatch.setattr(rewards, "high_terms", keep)
+    monkeypatch.setattr(high_rewards, "high_terms", keep)
     return kept
 
 

@@ -176,6 +176,20 @@ def test_prices_of_strides() -> None:
     assert np.mean(np.ptp(best, axis=1) >= 3) > 0.3
 
 
+def test_price_of_a_stride_on_flat_ground() -> None:
+    """Off by d m from the usual stride 10 d^2, off by d m in stance length 2 d^2, changed by d Hz
+    0.5 d^2, and 4 where the stride is longer than 0.48 m."""
+    plan, one = LeapPlan(1, RANGES), np.ones(1)
+    plan.look(0, np.empty((0, 2)), 0.0)
+    motion = Motion(one, SPEED * one, SPEED * one, 0.0 * one, 2.6 * one, STRIDE * one)
+    price = plan.lesson(np.zeros(1, dtype=int), motion, Landing()).price[0]
+    f = np.linspace(*RANGES.frequency, FREQUENCIES)[:, None]
+    length = np.linspace(*RANGES.stance_length, LENGTHS)
+    by_hand = 10.0 * (SPEED / f - STRIDE) ** 2 + 0.5 * (f - 2.6) ** 2 + 4.0 * (SPEED / f > 0.48)
+    by_hand = by_hand + 2.0 * (length - STRIDE) ** 2
+    np.testing.assert_allclose(price, by_hand - by_hand.min(), atol=1e-9)
+
+
 def test_the_command_of_a_leap() -> None:
     command = np.tile(np.arange(15.0), (2, 1))
     leap_command(command, [2.2, 2.4], 0.36)

@@ -21,6 +21,7 @@ from tdgc.sim.observation import columns, width
 from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import make_tile, tile_rng
 from tdgc.state import State, split
+from tdgc.tasks import low_env
 from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.crossings import within
 from tdgc.tasks.ground import measure_ground
@@ -28,7 +29,6 @@ from tdgc.tasks.leaps import DURATION
 from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask, make_task
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_spaces
 from tdgc.tasks.low_statistics import summarise
-from tdgc.tasks.rewards import CONTACT_FORCE
 from tdgc.tasks.rules import is_fallen
 from tdgc.tasks.tiles import shallow
 
@@ -854,6 +854,45 @@ def test_a_reset_leaves_the_commands_of_other_robots() -> None:
     task.close()
 
 
+def test_falls_of_free_commands_drawn_for_the_first_time_are_remembered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Crossings are steered, so their commands are not; a failed retry would soon crowd out all."""
+    task = begin(TILES, 3, training=True)
+    task.episodes.crossing[:] = [False, True, False]
+    task.episodes.retried[:] = [False, False, True]
+    monkeypatch.setattr(low_env, "is_fallen", lambda world: np.ones(3, dtype=bool))
+    asked = task.locomotion.command[0].copy()
+    task.step(still(task))
+    found = task.commands.falls[task.commands.falls[:, 0] >= 0.0]
+    np.testing.assert_array_equal(found, [[gait_index(asked), *asked[:12]]])
+    task.close()
+
+
+def test_landings_are_told_by_the_clock_before_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    task, given = begin(TILES, 2), []
+    monkeypatch.setattr(task.crossings, "learn_landing", lambda loco, clock: given.append(clock))
+    before = task.locomotion.clock.clock.copy()
+    task.step(still(task))
+    assert (task.locomotion.clock.clock != before).all()
+    np.testing.assert_array_equal(given, [before])
+    task.close()
+
+
+def test_trenches_under_the_hips_count_as_filled() -> None:
+    """The trunk's height is above the support surface; the probes see the trench."""
+    task = begin(dataclasses.replace(TILES, families=("gap",)))
+    assert task.field is not None
+    task.field.place(0, 0, make_tile("gap", 1.0, np.random.default_rng(0)))
+    trench = task.field.features[0, 0].trenches[0].mean()
+    loco = task.locomotion
+    loco.world.state.position[:] = [[trench - loco.world.state.geometry.hips[0, 0], 2.0, 0.31]]
+    loco.world.state.derive()
+    ground = measure_ground(loco)
+    assert ground.base[0] == pytest.approx(0.31, abs=1e-6) and ground.probes.min() < -0.5
+    task.close()
+
+
 def test_velocities_of_a_crossing_stay_within_their_bounds() -> None:
     low, high = np.array([-0.2, 0.0]), np.array([1.2, 0.0])
     wanted = np.array([[0.6, 0.3], [2.4, 1.0], [-0.8, -0.1], [0.0, 0.5]])
@@ -1044,7 +1083,7 @@ def test_what_the_terms_of_a_step_are_told() -> None:
         above = z - loco.world.support_height(x, y)
         np.testing.assert_allclose(told.foot_height, above, atol=0.03)  # of the foot's lowest point
         np.testing.assert_array_equal(told.contact, loco.clock.contact)
-        np.testing.assert_array_equal(task.episodes.was_contact, state.foot_force > CONTACT_FORCE)
+        np.testing.assert_array_equal(task.episodes.was_contact, state.foot_force > 1.0)
     assert (state.position[:, 2] - told.base_height).max() > 0.1
     task.close()
 

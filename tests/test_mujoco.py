@@ -241,7 +241,7 @@ def run(controller: Controller, family: str, **settings: float) -> tuple[trace.T
     """Run an episode on level 6; return the simulator's own trace of it and its log."""
     pair = runner.Deployed(controller, LogWriter(controller))
     assert pair.log is not None
-    watcher, cell = Tracer(pair, 0), Cell("tdgc", "nominal", family, 6, 0, 1)
+    watcher, cell = Tracer(pair), Cell("tdgc", "nominal", family, 6, 0, 1)
     runner.run_episode(cell, pair, MujocoConfig(**settings), 0, [watcher])  # type: ignore[arg-type]
     return watcher.traces()[0], pair.log
 
@@ -522,7 +522,7 @@ def test_what_is_complete_when_it_is_stopped_is_kept(
         ("--families moon", "unknown family 'moon'"),
         ("--episodes 0", "--episodes must be at least 1, not 0"),
         ("--video 3", "--video must lie in [0, --episodes], not 3"),
-        ("--gui --log", "--gui is only to be looked at: no --log"),
+        ("--gui --log", "--gui only shows the robot: no --log"),
         ("--set gravity=0", "unknown configuration key 'gravity'"),
         ("--set cone=round", "'cone' must be one of elliptic, pyramidal"),
         ("--set timestep=0", "'timestep' must be above 0, not 0"),

@@ -33,7 +33,8 @@ from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.terrain import ALL_FAMILIES, PARAMETER_RANGES
 from tdgc.tasks.high_observation import high_layout
-from tdgc.tasks.rewards import HIGH_TERMS, LOW_TERMS
+from tdgc.tasks.high_rewards import HIGH_TERMS
+from tdgc.tasks.low_rewards import LOW_TERMS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

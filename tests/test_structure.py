@@ -163,14 +163,14 @@ def test_rules_see_every_kind_of_import() -> None:
     tree = ast.parse(
         "import tdgc.sim.world as w\n"
         "from tdgc import config, __version__\n"
-        "from tdgc.tasks import rewards\n"
+        "from tdgc.tasks import high_rewards\n"
         "def f():\n"
         "    from tdgc.parallel.vec import TaskVecEnv\n"
         "    importlib.import_module('pybullet')\n"
     )
     found = list(imports(tree))
     assert [own(name) for name in found if name.startswith("tdgc")] == [
-        "sim.world", "config", "tdgc", "tasks.rewards", "parallel.vec"
+        "sim.world", "config", "tdgc", "tasks.high_rewards", "parallel.vec"
     ]  # fmt: skip
     assert "pybullet" in found
 

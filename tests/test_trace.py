@@ -18,14 +18,13 @@ from test_evaluation import SMALL
 import evaluate
 from tdgc.benchmark import evaluation, trace
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
-from tdgc.benchmark.evaluation import Cell, Episode, run_cell
+from tdgc.benchmark.evaluation import Batch, Cell, Episode, run_cell
 from tdgc.benchmark.trace import COLUMNS, Selection, Trace, TraceError, Tracer
 from tdgc.config import HighLevelConfig, HighRewardConfig
 from tdgc.sim.commands import CONTINUOUS, INDEX, NAMES, CommandDecoder
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import TileField
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 
@@ -36,10 +35,10 @@ HOLD = 5  # control steps per decision
 class Notes(Tracer):
     """A tracer that also keeps each robot's state at every control step."""
 
-    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
-        super().begin(cell, loco, field, goal)
-        self.goal, self.seen = goal, [self._note(loco)]
-        self.probes = height_probes(loco, PROBES[HighLevelConfig().probes])
+    def begin(self, batch: Batch) -> None:
+        super().begin(batch)
+        self.goal, self.seen = batch.goal, [self._note(batch.loco)]
+        self.probes = height_probes(batch.loco, PROBES[HighLevelConfig().probes])
 
     def step(self, step: int, live: Any, outcome: Any) -> None:
         super().step(step, live, outcome)
@@ -70,7 +69,7 @@ class Notes(Tracer):
 
 
 def watch(driver: Driver, cell: Cell, low: Any) -> tuple[Notes, list[Trace], list[Episode]]:
-    notes = Notes(driver, 5)
+    notes = Notes(driver)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "HORIZON", 1.04)  # 52 steps: the last decision is cut short
         episodes = run_cell(cell, low, driver, 5, [notes])
@@ -418,7 +417,7 @@ def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
     assert [(d["episode"], d["outcome"]) for d in diagnosed] == [
         (r["episode"], r["outcome"]) for r in failed
     ]
-    assert "most is to be won in gap, by decisions: 100.0 points" in capsys.readouterr().out
+    assert "largest possible gain: gap, decisions, 100.0 points" in capsys.readouterr().out
     # Fewer traces in the same folder: the old ones are removed.
     assert evaluate.main([*flags, "--trace", "1"]) == 0
     assert [p.name for p in (tmp_path / "traces").iterdir()] == ["gp_nominal_gap_10_000.parquet"]

@@ -32,6 +32,7 @@ from tdgc import calibration, policies
 from tdgc.config import (
     FIRST_TEACHER,
     CalibrationConfig,
+    CommandRanges,
     HighTrainConfig,
     LowTrainConfig,
     PPOConfig,
@@ -53,7 +54,7 @@ from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
 from tdgc.tasks.low_observation import low_mirror, low_spaces
-from tdgc.tasks.pairing import PRETRAINED
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -108,6 +109,7 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
 
 def test_two_checkpoints_are_kept(tmp_path: Path) -> None:
     model = learner(seed=0)
+    (tmp_path / ".step-000000000050.partial").mkdir()  # left by a process that was killed
     for steps in (100, 9, 2000, 2000):
         model.num_timesteps = steps
         Checkpoint.take(model, {}).save(tmp_path)
@@ -702,6 +704,19 @@ def test_flags_and_folders_that_cannot_be_used(
         ],
         "'env.terrain' has no effect: robots train on both": ["--set", "env.terrain=tiles"],
         "'ppo.batch_size' must be at least 2, not 1": ["--set", "ppo.batch_size=1"],
+        "'ppo.n_steps' times 'n_envs' must be at least 2, not 1": [
+            "--n-envs",
+            "1",
+            "--workers",
+            "1",
+            "--set",
+            "ppo.n_steps=1",
+        ],
+        "'env.first_levels' must be at most the 2 levels, not 3": ["--set", "env.levels=2"],
+        "'env.episode_seconds' must last a step of 0.02 s, not 0.005": [
+            "--set",
+            "env.episode_seconds=0.005",
+        ],
         "'calibration.robots' must be 0 or at least 64": ["--set", "calibration.robots=63"],
         "--worker-timeout must be above 0 and at most 86400, not inf": ["--worker-timeout", "inf"],
         "terrain 'no.npy' cannot be read as a NumPy": ["--set", 'env.families=["flat","no.npy"]'],
@@ -723,20 +738,21 @@ def test_flags_and_folders_that_cannot_be_used(
         ("env.levels=0", "'env.levels' must be at least 1, not 0"),
         ("env.levels=13", "'env.levels' must be from 1 to 11, not 13"),
         ("env.decimation=0", "'env.decimation' must be at least 1, not 0"),
+        ("env.decimation=2001", "'env.episode_seconds' must last a step of 40.02 s, not 20"),
         ("env.families=[]", "'env.families' must name at least one terrain family"),
         ("env.randomisation.payload=[-20,0]", "'randomisation.payload' times its scale must be "),
         (
             "env.commands.vy=[-0.2,0.6]",
             "commands.vy must be the same to both sides for a symmetric",
         ),
-        ("start_speed=3", "'start_speed' or 'start_swing' cannot be walked: vx 3.0 is outside "),
+        ("start_speed=3", "'start_speed' or 'start_swing' is out of bounds: vx 3.0 is outside "),
         ("ppo.minibatches=0", "'ppo.minibatches' must be at least 1, not 0"),
         ("ppo.minibatches=101", "'ppo.minibatches' must be at most the 100 robots, not 101"),
         ("imitation.minibatches=101", "'imitation.minibatches' must be at most the 100 robots"),
         ("ppo.initial_std=0", "'ppo.initial_std' must be above 0, not 0"),
         ("seed=-1", "'seed' must be at least 0, not -1"),
         ("steps=0", "'steps' must be at least 1, not 0"),
-        ("ppo.ent_coef=0", "'ppo.imitation_coef' needs an 'ppo.ent_coef' above 0; or set it to 0"),
+        ("ppo.ent_coef=0", "'ppo.imitation_coef' needs 'ppo.ent_coef' above 0; or set it to 0"),
         ("env.unknown_share=1.5", "'env.unknown_share' must be from 0 to 1, not 1.5"),
         ("env.unknown_share=-0.1", "'env.unknown_share' must be from 0 to 1, not -0.1"),
         ("env.randomisation.scale=1.5", "'randomisation.latency' times its scale must be "),
@@ -750,7 +766,11 @@ def test_flags_and_folders_that_cannot_be_used(
         assert capsys.readouterr().err.startswith(f"train_high.py: {message}")
     alone = ["--set", "ppo.lstm=null"]
     assert train_high.main([*alone, "--out", str(empty)]) == 2
-    assert "'ppo.encoder' must be [] where 'ppo.lstm' is null" in capsys.readouterr().err
+    assert "'ppo.encoder' must be [] if 'ppo.lstm' is null" in capsys.readouterr().err
+    short = ["--set", "ppo.n_steps=1", "--set", "ppo.minibatches=100"]
+    assert train_high.main([*short, "--out", str(empty)]) == 2
+    message = "'ppo.n_steps' times 'n_envs' per 'ppo.minibatches' must be at least 2, not 1"
+    assert message in capsys.readouterr().err
     assert not empty.exists()
 
 
@@ -820,11 +840,37 @@ def test_the_low_policy_is_what_the_first_command_left(
     left = {key: value for key, value in low.meta.items() if key != "calibration"}
     policies.save_copy(tmp_path / "runs" / "low" / "policy", low, {}, left)
     assert train_high.find_low() == shipped
-    assert "runs/low/policy is not final" in "".join(capsys.readouterr())
+    assert "runs/low/policy comes from an unfinished run" in "".join(capsys.readouterr())
     policies.save_copy(
         tmp_path / "runs" / "low" / "policy", low, {}, {**left, "calibration": {"robots": 64}}
     )
     assert train_high.find_low() == "runs/low/policy"
+
+
+def test_one_range_may_be_narrowed_and_the_others_stay_the_low_policys(tmp_path: Path) -> None:
+    low = policies.load(PRETRAINED / "low")
+    wide = dataclasses.replace(CommandRanges(), vy=(-0.4, 0.4), pitch=(-0.2, 0.1))
+    config = dataclasses.replace(load_low(low)[1], commands=wide)
+    policies.save_copy(tmp_path / "low", low, {}, {**low.meta, "config": to_dict(config)})
+    small = ["--steps", "96", "--n-envs", "4", "--workers", "1", "--time-limit", "0"]
+    flags = ["--no-teacher", "--low", str(tmp_path / "low"), "--set", "env.commands.vx=[-0.5,0.5]"]
+    assert train_high.main([*small, *flags, "--out", str(tmp_path / "run")]) == 0
+    stored = json.loads((tmp_path / "run" / "config.json").read_text(encoding="utf-8"))
+    used = from_dict(CommandRanges, stored["env"]["commands"])
+    assert used == dataclasses.replace(wide, vx=(-0.5, 0.5))
+
+
+def test_a_curve_that_cannot_be_drawn_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It comes after the training, whose policy is kept."""
+    (tmp_path / "training.png").mkdir()
+    small = ["--steps", "96", "--n-envs", "4", "--workers", "1", "--set", "ppo.n_steps=24"]
+    flags = ["--no-teacher", "--set", "ppo.minibatches=1", "--out", str(tmp_path)]
+    assert train_high.main([*small, *flags]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("train_high.py: ") and last.endswith(f"'{tmp_path / 'training.png'}'")
+    assert policies.load(tmp_path / "policy").kind == "lstm"
 
 
 def test_a_run_with_another_robot_takes_what_fits_it(

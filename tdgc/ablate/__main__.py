@@ -93,7 +93,7 @@ def without_missing(chosen: Sequence[Variant], low: Path) -> list[Variant]:
         return list(chosen)
     left_out = [variant.name for variant in chosen if variant.low == "uncalibrated"]
     if left_out:
-        print(f"without {' and '.join(left_out)}: there is no '{uncalibrated(low)}'")
+        print(f"{' and '.join(left_out)} left out: there is no '{uncalibrated(low)}'")
     return [variant for variant in chosen if variant.low != "uncalibrated"]
 
 

@@ -430,6 +430,6 @@ def describe(diagnoses: Sequence[Diagnosis], episodes: Sequence[Episode]) -> str
             lines.append(f"{cell['family'].ljust(wide)}{cell['level']:>5}{numbers}  {cause}")
         for family, layer, points in run["most"]:
             lines.append(
-                f"most is to be won in {family}, by {layer}: {points:.1f} points of success"
+                f"largest possible gain: {family}, {layer}, {points:.1f} points of success"
             )
     return "\n".join(lines)

@@ -25,6 +25,7 @@ from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.tasks.high_observation import SEMANTIC, HighObserver, high_layout
 from tdgc.tasks.pairing import paired
+from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.teacher import Skill, Teacher, toward
 
 
@@ -167,7 +168,7 @@ class HierarchyDriver(Driver):
             self.told = SEMANTIC[seen]
         self._observer = HighObserver(loco, config, noise)
         seconds = config.decimation * loco.physics.control_dt
-        self._horizon = round(config.episode_seconds / seconds)
+        self._horizon = episode_steps(config.episode_seconds, seconds)
         self._state: Any = None
         self._last = np.zeros((m, NUM_ACTIONS))
 

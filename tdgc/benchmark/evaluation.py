@@ -22,7 +22,7 @@ from tdgc.policies import Policy
 from tdgc.sim.commands import gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array, RobotState
+from tdgc.sim.robot import Array
 from tdgc.sim.sensors import EpisodeDraws, Noise
 from tdgc.sim.terrain import (
     EVAL_STREAM,
@@ -146,8 +146,8 @@ class Episode(EpisodeRecord):
     Attributes:
         time_s: duration in s.
         path_m: length of the trunk's path in m.
-        energy_j: mechanical energy in J: ``joint_power`` at the end of each control step, times
-            the step's length.
+        energy_j: mechanical energy in J: ``RobotState.power`` at the end of each control step,
+            times the step's length.
         shares: share of the time in each gait of ``GAITS``, as commanded.
         goal: (2,) m in the tile's frame.
         track: (n, 3), x and y in m in the tile's frame and heading in rad, every ``POSE_SECONDS``
@@ -210,16 +210,11 @@ def push_velocities(cell: Cell, seed: int, speed: float, pushes: int) -> Array:
     return speed * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
 
 
-def joint_power(state: RobotState) -> Array:
-    """Sum of the absolute mechanical power of the joints, (M,) W: braking recovers no energy."""
-    return np.asarray(np.abs(state.torque * state.qd).sum(axis=1))
-
-
 class Watcher(Protocol):
     """Observes a batch while it runs; it must not change anything."""
 
-    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
-        """Handle the beginning, with robots at their starts; ``goal`` is (M, 2) m in the world."""
+    def begin(self, batch: "Batch") -> None:
+        """Handle the beginning, with the robots of ``batch`` at their starts."""
 
     def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
         """Handle the end of control step number ``step``.
@@ -331,7 +326,7 @@ class EpisodeLog:
         position = state.position[:, :2].copy()
         self._path[live] += np.linalg.norm(position - self._position, axis=1)[live]
         self._position = position
-        self._energy[live] += self._dt * joint_power(state)[live]
+        self._energy[live] += self._dt * state.power[live]
         self._shares[live, gait_index(batch.loco.command[live])] += 1.0
         self._steps[live] = step + 1
         time_is_up = step + 1 == self._horizon
@@ -381,7 +376,7 @@ def run_cell(
     try:
         driver.begin(batch.loco, batch.goal, batch.told, batch.probes)
         for watcher in watchers:
-            watcher.begin(cell, batch.loco, batch.field, batch.goal)
+            watcher.begin(batch)
         log = EpisodeLog(batch)
         closed_loop(driver, Executor(batch.loco, low, batch.sensors), batch, log, watchers)
     finally:

@@ -139,7 +139,7 @@ def traced(
     driver: Driver, low: Policy, family: str, level: int, count: int, seed: int
 ) -> list[Trace]:
     """Run the first ``count`` episodes of a cell and return their traces."""
-    tracer = Tracer(driver, seed)
+    tracer = Tracer(driver)
     run_cell(Cell("planted", "nominal", family, level, 0, count), low, driver, seed, [tracer])
     return tracer.traces()
 

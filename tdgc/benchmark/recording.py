@@ -8,13 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import Cell, EpisodeRecord
+from tdgc.benchmark.evaluation import Batch, EpisodeRecord
 from tdgc.config import RobotConfig
 from tdgc.sim.commands import command_bounds
-from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import TileField
-from tdgc.tasks.rewards import CONTACT_FORCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +53,16 @@ class Recorder:
 
     Args:
         driver: the driver of the batch.
-        seed: seed of the evaluation's tiles.
         count: episodes with a number below this are recorded.
     """
 
-    def __init__(self, driver: Driver, seed: int, count: int) -> None:
-        self._driver, self._seed, self._count = driver, seed, count
+    def __init__(self, driver: Driver, count: int) -> None:
+        self._driver, self._count = driver, count
 
-    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
-        self._cell, self._loco = cell, loco
+    def begin(self, batch: Batch) -> None:
+        self._batch, cell = batch, batch.cell
         self._rows = np.arange(max(0, min(cell.count, self._count - cell.first)))
-        self._origin = np.zeros((len(self._rows), 3))
-        self._origin[:, :2] = field.origin(self._rows, 0)
+        self._origin = np.pad(batch.origin[self._rows], ((0, 0), (0, 1)))
         self._steps = np.zeros(cell.count, dtype=int)
         self._outcome = np.full(cell.count, -1)
         self._kept: list[dict[str, NDArray[Any]]] = []
@@ -75,11 +70,10 @@ class Recorder:
     def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
         self._outcome = outcome.copy()
         self._steps[live] = step + 1
-        rows, loco = self._rows, self._loco
+        rows, loco = self._rows, self._batch.loco
         if not np.isin(rows, live).any():
             return
-        world, state = loco.world, loco.world.state
-        support = world.support_height(state.position[rows, 0], state.position[rows, 1])
+        state = loco.world.state
         self._kept.append(
             {
                 "position": state.position[rows] - self._origin,
@@ -87,15 +81,15 @@ class Recorder:
                 "q": state.q[rows],
                 "command": loco.command[rows],
                 "velocity": np.column_stack([state.heading_vel[rows, :2], state.ang_vel[rows, 2]]),
-                "height": state.position[rows, 2] - support,
-                "contact": state.foot_force[rows] > CONTACT_FORCE,
+                "height": loco.world.trunk_height()[rows],
+                "contact": state.touching[rows],
                 "desired": loco.clock.contact[rows] > 0.5,
             }
         )
 
     def recordings(self) -> list[Recording]:
         """Return the recordings of the last batch watched, in order."""
-        cell, loco = self._cell, self._loco
+        batch, loco = self._batch, self._batch.loco
         bounds = command_bounds(self._driver.bounds)
         result = []
         for k in self._rows:
@@ -105,7 +99,7 @@ class Recorder:
             }
             result.append(
                 Recording(
-                    **cell.record(int(k), self._seed, self._outcome[k]),
+                    **batch.cell.record(int(k), batch.seed, self._outcome[k]),
                     robot=loco.robot,
                     dt=loco.physics.control_dt,
                     bounds=bounds,

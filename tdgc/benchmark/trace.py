@@ -19,27 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import Cell, EpisodeRecord, joint_power
+from tdgc.benchmark.evaluation import Batch, EpisodeRecord
 from tdgc.config import CommandRanges
 from tdgc.errors import InputError, require
 from tdgc.files import atomic
-from tdgc.sim.commands import (
-    CONTINUOUS,
-    INDEX,
-    NAMES,
-    NUM_ACTIONS,
-    UNITS,
-    CommandDecoder,
-    gait_index,
-)
+from tdgc.sim.commands import CONTINUOUS, INDEX, NAMES, UNITS, CommandDecoder, gait_index
 from tdgc.sim.gaits import FEET, GAITS
-from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, to_goal, wrap_angle
-from tdgc.sim.terrain import TileField
-from tdgc.tasks import rewards
-from tdgc.tasks.high_env import high_step, shares_of_ranges
+from tdgc.tasks.high_rewards import HIGH_TERMS, HighReward
 from tdgc.tasks.probes import NUM_PROBES, PROBES
-from tdgc.tasks.rewards import CONTACT_FORCE, HIGH_TERMS
+from tdgc.tasks.rules import episode_steps
 
 FORMAT = "tdgc-trace"
 VERSION = 3
@@ -180,7 +169,7 @@ def probe_columns(heights: Array) -> dict[str, NDArray[Any]]:
 def tilt(gravity: Array) -> tuple[Array, Array]:
     """Pitch and roll, (n,) rad each, from gravity (n, 3) in the trunk frame.
 
-    The inverse of ``rewards.commanded_gravity``.
+    The inverse of ``low_rewards.commanded_gravity``.
     """
     x, y, z = gravity.T
     return np.arcsin(np.clip(x, -1.0, 1.0)), np.arctan2(-y, -z)
@@ -191,23 +180,20 @@ class Tracer:
 
     Args:
         driver: what drives the batch.
-        seed: seed of the evaluation's tiles.
     """
 
-    def __init__(self, driver: Driver, seed: int) -> None:
-        self._driver, self._seed = driver, seed
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
 
-    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
-        m, config = loco.num_robots, self._driver.config
-        self._cell, self._loco, self._goal = cell, loco, goal
-        self._origin = field.origin(np.arange(m), 0)
-        self._dt = loco.physics.control_dt
+    def begin(self, batch: Batch) -> None:
+        self._batch, self._loco = batch, batch.loco
+        m, config = self._loco.num_robots, self._driver.config
+        self._dt = self._loco.physics.control_dt
         self._decimation = config.decimation
-        self._horizon = round(config.episode_seconds / (self._decimation * self._dt))
-        self._decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
-        middle = shares_of_ranges(self._decoder.decode(np.zeros(NUM_ACTIONS)), self._decoder)
-        self._shares = np.tile(middle, (3, m, 1))
-        self._actions = np.zeros((2, m, NUM_ACTIONS))
+        seconds = self._decimation * self._dt
+        self._horizon = episode_steps(config.episode_seconds, seconds)
+        decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
+        self._rewards = HighReward(config, decoder, m, seconds)
         self._steps = np.zeros(m, dtype=int)
         self._decisions = np.zeros(m, dtype=int)
         self._outcome = np.full(m, -1)
@@ -227,7 +213,7 @@ class Tracer:
         """The traces of the most recently watched batch, in order."""
         if self._count.any():  # the last episodes ended between two decisions
             self._look()
-        cell, result, driver = self._cell, [], self._driver
+        cell, result, driver = self._batch.cell, [], self._driver
         places = "" if driver.probes is None else probe_places(PROBES[driver.config.probes])
         for k in range(cell.count):
             rows = self._rows[: self._decisions[k] + 1]
@@ -237,7 +223,7 @@ class Tracer:
                 columns[c.name] = np.array([row[c.name][k] for row in rows], dtype=kind)
                 if c.name in _DECIDED:  # other robots may have decided after this one ended
                     columns[c.name][-1] = None if kind is object else np.nan
-            record = cell.record(k, self._seed, self._outcome[k])
+            record = cell.record(k, self._batch.seed, self._outcome[k])
             result.append(Trace(**record, columns=columns, probes=places))
         return result
 
@@ -248,7 +234,7 @@ class Tracer:
         self._count = np.zeros(m)
         self._error = np.zeros((m, len(TRACKED)))
         self._contact, self._match = np.zeros((m, 4)), np.zeros((m, 4))
-        self._power, self._force = np.zeros(m), np.zeros((m, 5))
+        self._power = np.zeros(m)
 
     def _decide(self, live: NDArray[np.intp]) -> None:
         """Add the decision just taken to the latest row, which holds the state it was based on."""
@@ -256,45 +242,41 @@ class Tracer:
         self._decisions[live] += 1
         if driver.action is not None:
             row.update(action_columns(driver.action))
-            self._actions = np.stack([self._decoder.normalise(driver.action), self._actions[0]])
         row.update(command_columns(command, self._loco.carried_out, driver.bounds))
         if driver.probes is not None:
             row.update(probe_columns(driver.probes))
-        share = shares_of_ranges(command, self._decoder)
-        self._shares = np.concatenate([share[None], self._shares[:-1]])
+        self._rewards.decide(command, driver.action)
         self._clear()
 
     def _measure(self, live: NDArray[np.intp]) -> None:
         """Accumulate the measurements of one control step of the ``live`` robots."""
         loco = self._loco
         state = loco.world.state
-        pitch, roll = tilt(state.gravity)
+        height = loco.world.trunk_height() - loco.robot.base_height  # as the command is
         measured = np.stack(
-            [*state.heading_vel[:, :2].T, state.ang_vel[:, 2], self._height(), pitch, roll], axis=1
+            [*state.heading_vel[:, :2].T, state.ang_vel[:, 2], height, *tilt(state.gravity)], axis=1
         )
-        measured[:, 3] -= loco.robot.base_height  # the command is relative to it
         wanted = loco.command[:, [INDEX[name] for name in TRACKED]]
-        touching = state.foot_force > CONTACT_FORCE
         self._steps[live] += 1
         self._count[live] += 1.0
         self._error[live] += (measured - wanted)[live]
-        self._contact[live] += touching[live]
-        self._match[live] += (touching == (loco.clock.contact > 0.5))[live]
-        self._power[live] += joint_power(state)[live]
-        force = np.column_stack([state.trunk_force, state.leg_force])
-        self._force[live] = np.maximum(self._force[live], force[live])
+        self._contact[live] += state.touching[live]
+        self._match[live] += (state.touching == (loco.clock.contact > 0.5))[live]
+        self._power[live] += state.power[live]
+        self._rewards.measure(state, live)
 
     def _look(self) -> None:
         """Start a new row: the current state, and how the previous decision was carried out."""
         state = self._loco.world.state
-        distance, direction = to_goal(state, self._goal)
+        distance, direction = to_goal(state, self._batch.goal)
         nothing = np.full(self._loco.num_robots, np.nan)
         row: dict[str, NDArray[Any]] = {
             c.name: nothing if c.unit else np.full(len(nothing), None, object) for c in COLUMNS
         }
         row["time"] = self._dt * self._steps
-        row["base_x"], row["base_y"] = (state.position[:, :2] - self._origin).T
-        row["base_z"], row["base_height"] = state.position[:, 2].copy(), self._height()
+        row["base_x"], row["base_y"] = (state.position[:, :2] - self._batch.origin).T
+        row["base_z"] = state.position[:, 2].copy()
+        row["base_height"] = self._loco.world.trunk_height()
         row["yaw"] = state.yaw.copy()
         row["pitch"], row["roll"] = tilt(state.gravity)
         row["goal_distance"], row["goal_bearing"] = distance, wrap_angle(direction - state.yaw)
@@ -312,22 +294,14 @@ class Tracer:
         for k, foot in enumerate(FEET):
             row[f"contact_{foot}"] = self._contact[:, k] / count
             row[f"match_{foot}"] = self._match[:, k] / count
-        row["trunk_force"], row["leg_force"] = self._force[:, 0], self._force[:, 1:].max(axis=1)
+        force = self._rewards.force
+        row["trunk_force"], row["leg_force"] = force[:, 0].copy(), force[:, 1:].max(axis=1)
         row["power"] = self._power / count
         # As in training, a decision that ends early is rewarded for its full duration.
-        config = self._driver.config.rewards
-        share = len(self._rows) / self._horizon
-        seen = high_step(
-            self._loco, self._goal, share, self._actions, self._shares, self._force, config
-        )
-        for name, value in rewards.high_terms(seen, self._decimation * self._dt).items():
+        share = np.full(len(count), len(self._rows) / self._horizon)
+        for name, value in self._rewards.terms(self._loco, self._batch.goal, share).items():
             if name != "action_rate" or self._driver.action is not None:
                 row[f"reward_{name}"] = value
-
-    def _height(self) -> Array:
-        world = self._loco.world
-        x, y, z = world.state.position.T
-        return np.asarray(z - world.support_height(x, y))
 
 
 # ---------------------------------------------------------------------------- files

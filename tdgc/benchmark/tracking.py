@@ -19,7 +19,6 @@ from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EVAL_STREAM
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import load_low
-from tdgc.tasks.rewards import CONTACT_FORCE
 from tdgc.tasks.rules import is_fallen
 
 _TRACKING_SECONDS = 10.0  # length of a tracking episode, which has one command
@@ -82,7 +81,7 @@ def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, fl
             lin += float(np.sum((state.heading_vel[:, :2] - command[:, :2]) ** 2))
             yaw += float(np.sum((state.ang_vel[:, 2] - command[:, INDEX["yaw_rate"]]) ** 2))
             wanted = loco.clock.contact > 0.5
-            match += float(np.mean((state.foot_force > CONTACT_FORCE) == wanted)) * episodes
+            match += float(np.mean(state.touching == wanted)) * episodes
             count += episodes
         loco.command[:] = command
     return {

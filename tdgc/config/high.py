@@ -13,8 +13,8 @@ class HighRewardConfig:
 
     The paper gives the terms but no numbers; values without a stated origin are our own.
 
-    Weights are per second: ``tdgc.tasks.rewards.high_terms`` multiplies them by the duration of a
-    decision. With ``step_time_scaling`` off, they are per decision.
+    Weights are per second: ``tdgc.tasks.high_rewards.high_terms`` multiplies them by the duration
+    of a decision. With ``step_time_scaling`` off, they are per decision.
     """
 
     step_time_scaling: bool = field(default=True, metadata={"before": True})

@@ -10,7 +10,7 @@ from tdgc.config.sim import CommandRanges, PhysicsConfig, RandomisationConfig, R
 
 @dataclass(frozen=True)
 class LowRewardConfig:
-    """Weights of the low policy's reward, one field per term of ``tdgc.tasks.rewards.LOW_TERMS``.
+    """Weights of the low policy's reward, one per term of ``tdgc.tasks.low_rewards.LOW_TERMS``.
 
     Penalties are those of Walk These Ways (its published table), some changed by up to a factor of
     two where the first policies showed the need (docs/experiments.md). ``power`` is our own; it is

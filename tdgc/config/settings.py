@@ -112,7 +112,10 @@ def recorded(cls: type[Config], data: Mapping[str, Any], source: object) -> Conf
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from error
     for key, value in _missing(to_dict(config), _with_before(cls, data)):
-        raise ConfigError(f"{source}: no key '{key}', by default {value}; say what it was")
+        raise ConfigError(
+            f"{source}: the key '{key}' is missing (default {value}); add the value that it was "
+            "trained with"
+        )
     return config
 
 

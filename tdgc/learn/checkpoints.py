@@ -132,7 +132,8 @@ class Checkpoint:
         text = json.dumps({**header, "sha256": _checksum(data, header)})
         final = folder / f"step-{self.steps:012d}"
         partial = folder / f".{final.name}.partial"
-        shutil.rmtree(partial, ignore_errors=True)
+        for left in folder.glob(".step-*.partial"):  # by a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
         partial.mkdir(parents=True)
         try:
             for name, content in (("state.safetensors", data), ("state.json", text.encode())):

@@ -88,8 +88,8 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
             seed = config.seed
         except ConfigError as error:
             raise ConfigError(
-                f"{error}; a run of another version cannot go on: start one in another folder, "
-                f"with --init {args.out / 'policy'} to begin from its policy"
+                f"{error}; a run of another version cannot be resumed: start one in another "
+                f"folder, with --init {args.out / 'policy'} to begin from its policy"
             ) from error
     elif stored.exists():
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")

@@ -5,12 +5,22 @@ from typing import Any
 
 import torch as th
 
-from tdgc.config import PPOConfig, RecurrentPPOConfig
+from tdgc.config import ConfigError, PPOConfig, RecurrentPPOConfig
 
 _SHARED = (
     "n_steps", "n_epochs", "gamma", "gae_lambda", "clip_range", "ent_coef", "vf_coef",
     "max_grad_norm",
 )  # fmt: skip
+
+
+def check_batch(name: str, steps: int) -> None:
+    """Refuse a batch of one step, because PPO normalises the advantages of each batch.
+
+    Raises:
+        ConfigError: ``name`` says what the number of steps is.
+    """
+    if steps < 2:
+        raise ConfigError(f"'{name}' must be at least 2, not {steps}")
 
 
 def shared_keywords(ppo: PPOConfig | RecurrentPPOConfig) -> dict[str, Any]:

@@ -330,14 +330,14 @@ def strip(recordings: Sequence[Recording], folder: Path) -> Path:
     first = recordings[0]
     tiles = {(r.condition, r.family, r.level, r.episode, r.seed) for r in recordings}
     if len(tiles) > 1:
-        raise ValueError(f"a strip is of one tile, not of {len(tiles)}")
+        raise ValueError(f"a strip shows one tile, not {len(tiles)}")
     left, head, gap = 112, 40, 6
     width = left + _MOMENTS * (_SHOT[0] + gap)
     image = Image.new("RGB", (width, head + len(recordings) * (_SHOT[1] + gap)), "white")
     draw = ImageDraw.Draw(image)
     title = f"{first.family}, level {first.level}, {first.condition}, episode {first.episode}"
     draw.text((left, head // 2), title, _INK, _font(20, bold=True), "lm")
-    draw.text((width - gap, head // 2), "line: way of the base", _INK, _font(15), "rm")
+    draw.text((width - gap, head // 2), "line: path of the base", _INK, _font(15), "rm")
     for row, r in enumerate(recordings):
         y = head + row * (_SHOT[1] + gap)
         draw.text((8, y + 108), r.policy, POLICY_COLOURS[r.policy], _font(20, bold=True), "lm")

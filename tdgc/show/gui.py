@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import CONDITIONS, Cell, physics_of, run_cell, tile_of
+from tdgc.benchmark.evaluation import CONDITIONS, Batch, Cell, physics_of, run_cell, tile_of
 from tdgc.policies import Policy
 from tdgc.show.film import field_of, set_stage
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, CommandDecoder, default_command, gait_index
@@ -126,9 +126,9 @@ class Monitor:
         self._stage = stage
         self.text = ""
 
-    def begin(self, cell: Cell, loco: Locomotion, field: TileField, goal: Array) -> None:
-        self._loco = loco
-        self._window = _Window(loco, field, self._stage)
+    def begin(self, batch: Batch) -> None:
+        self._loco = batch.loco
+        self._window = _Window(batch.loco, batch.field, self._stage)
 
     def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
         self.text = describe(self._loco.command[0])

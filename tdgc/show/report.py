@@ -38,19 +38,19 @@ FIGURES = (
     (
         "success.png",
         "Success by family and level, with Wilson 95 % intervals",
-        "A panel a terrain family: success rate over the level, a line a policy. The tables above "
-        "have the same numbers.",
+        "One panel per terrain family: success rate against level, one line per policy. The "
+        "tables above give the same numbers.",
     ),
     ("gaits.png", "Time in each gait by family", "Bars of each policy's share of time in a gait."),
     (
         "headings.png",
-        "Where the nose points against the direction of travel",
+        "Body heading relative to the direction of travel",
         "Polar histograms by family and policy of the angle between heading and travel.",
     ),
     (
         "trajectories.png",
         "Some episodes from above, on the hardest level",
-        "Tiles from above, a row a family, with the ways of some robots from start to goal.",
+        "Tiles from above, one row per family, with the paths of some robots from start to goal.",
     ),
 )
 

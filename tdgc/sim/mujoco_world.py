@@ -9,7 +9,7 @@ import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
 from tdgc.config.settings import NotNegative, Positive
 from tdgc.sim.geometry import read_geometry
-from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import GRAVITY, Array, RobotState, pd_torque, rotation_matrix
 from tdgc.sim.terrain import TileField
 from tdgc.sim.urdf import JOINTS, urdf_path
@@ -277,10 +276,10 @@ class Window:
     def __exit__(self, *error: object) -> None:
         self._open.close()
 
-    def begin(self, cell: object, loco: Locomotion, field: TileField, goal: Array) -> None:
+    def begin(self, batch: Any) -> None:
         from mujoco import viewer
 
-        world = loco.world
+        world = batch.loco.world
         assert isinstance(world, MujocoWorld)
         self._dt, self._due = world.physics.control_dt, time.perf_counter()
         opened = viewer.launch_passive(

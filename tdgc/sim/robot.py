@@ -340,6 +340,9 @@ def wrap_angle(angle: Array) -> Array:
     return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
+CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact
+
+
 @dataclass
 class RobotState:
     """State of M robots as simulated after a control step, and quantities derived from it.
@@ -395,6 +398,16 @@ class RobotState:
     def body_rate(self) -> Array:
         """Angular velocity in the body frame, as a gyro measures it, (M, 3) rad/s."""
         return np.einsum("mji,mj->mi", self.rotation, self.ang_vel)
+
+    @property
+    def touching(self) -> NDArray[np.bool_]:
+        """Whether each foot is in contact, (M, 4)."""
+        return np.asarray(self.foot_force > CONTACT_FORCE)
+
+    @property
+    def power(self) -> Array:
+        """Sum of the absolute mechanical power of the joints, (M,) W: braking recovers nothing."""
+        return np.asarray(np.abs(self.torque * self.qd).sum(axis=1))
 
     def derive(self) -> None:
         """Compute the fields that follow from the simulated ones.

@@ -532,6 +532,11 @@ class World:
         """Height in m of the fall rule's support surface: trenches filled, pillars removed."""
         return np.zeros_like(x) if self.field is None else self.field.support_at(x, y)
 
+    def trunk_height(self) -> Array:
+        """Height of each trunk above the support surface under it, (M,) m."""
+        x, y, z = self.state.position.T
+        return np.asarray(z - self.support_height(x, y))
+
     def picture(
         self,
         row: int,

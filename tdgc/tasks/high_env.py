@@ -11,72 +11,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.config import HighLevelConfig, HighRewardConfig
+from tdgc.config import HighLevelConfig
 from tdgc.policies import Policy
 from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, default_command, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.robot import Array, to_goal
+from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import draw_start_goal
 from tdgc.state import State, copies, fill
-from tdgc.tasks import rewards
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, HighObserver, high_spaces
+from tdgc.tasks.high_rewards import HighReward
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.pushes import Pushes
-from tdgc.tasks.rules import REACHED, has_failed, outcome
+from tdgc.tasks.rules import REACHED, episode_steps, has_failed, outcome
 from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.teacher import WAY, Skill, Teacher
 from tdgc.tasks.tiles import TrainingTiles, shallow
-
-
-def shares_of_ranges(commands: Array, decoder: CommandDecoder) -> Array:
-    """Commands (..., 15) as shares of the decoder's ranges, which puts differences on one scale."""
-    span = np.where(decoder.high > decoder.low, decoder.high - decoder.low, 1)
-    return np.asarray((commands - decoder.low) / span)
-
-
-def high_step(
-    loco: Locomotion,
-    goal: Array,
-    time_share: Array | float,
-    actions: Array,
-    shares: Array,
-    force: Array,
-    config: HighRewardConfig,
-) -> rewards.HighStep:
-    """The inputs of the reward terms, after a decision has been carried out.
-
-    Args:
-        loco: the robots.
-        goal: (M, 2) m in the world.
-        time_share: t / T_max, (M,) or a single value for all robots.
-        actions: (2, M, 13) of this decision and the one before, normalised.
-        shares: (3, M, 15) ``shares_of_ranges`` of this decision and the two before.
-        force: (M, 5) N, largest contact forces since the decision: on the trunk, and on each leg
-            above the foot.
-        config: weights and constants.
-    """
-    state = loco.world.state
-    distance, direction = to_goal(state, goal)
-    x, y = state.position[:, 0], state.position[:, 1]
-    return rewards.HighStep(
-        distance=distance,
-        heading_error=direction - state.yaw,
-        time_share=np.broadcast_to(time_share, x.shape),
-        lin_vel=state.lin_vel,
-        ang_vel=state.ang_vel,
-        joint_speed=state.qd,
-        base_height=state.position[:, 2] - loco.world.support_height(x, y),
-        standing_height=loco.robot.base_height,
-        actions=actions,
-        commands=shares,
-        contact_forces=force,
-        config=config,
-    )
 
 
 class NavigationTask:
@@ -122,7 +76,7 @@ class NavigationTask:
         self.decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
         self.rng = np.random.default_rng(seed)
         self.step_seconds = config.decimation * self.low_config.physics.control_dt
-        self.horizon = round(config.episode_seconds / self.step_seconds)
+        self.horizon = episode_steps(config.episode_seconds, self.step_seconds)
         self._hold_decisions = round(config.hold_seconds / self.step_seconds)
         rank, self.family = np.divmod(first + np.arange(m), len(config.families))
         levels = rank % config.first_levels + config.first_level
@@ -146,8 +100,7 @@ class NavigationTask:
         self._untold = np.full(m, not semantic)
         self._next_push = np.zeros(m)
         self._pushes = Pushes(config.randomisation, self.rng, self.step_seconds, self._next_push)
-        self._actions = np.zeros((2, m, NUM_ACTIONS))
-        self._commands = np.zeros((3, m, 15))
+        self.rewards = HighReward(config, self.decoder, m, self.step_seconds)
         self.stats = Sums()
         self.teacher = None
         if taught is not None:
@@ -185,9 +138,7 @@ class NavigationTask:
             self.locomotion.randomise(index, self.config.randomisation, rng, width)
             self._pushes.schedule(index, self.elapsed)
             self._untold[index] = rng.uniform(size=n) < self._unknown_share
-        self._actions[:, index] = 0.0
-        middle = self.decoder.decode(np.zeros(NUM_ACTIONS))
-        self._commands[:, index] = shares_of_ranges(middle, self.decoder)
+        self.rewards.begin(index)
         self.locomotion.command[index] = default_command()  # as in the evaluation
         self.locomotion.place(
             index, starts[:, :2] + self._origin[index], starts[:, 2], rng.uniform(size=n)
@@ -226,37 +177,23 @@ class NavigationTask:
         loco, c = self.locomotion, self.config
         actions = np.where(self._led[:, None], self._taught, actions)
         self._decisions += 1
-        self._actions = np.stack([self.decoder.normalise(actions), self._actions[0]])
         commands = self.decoder.decode(actions)
-        share = shares_of_ranges(commands, self.decoder)
-        self._commands = np.concatenate([share[None], self._commands[:-1]])
+        self.rewards.decide(commands, actions)
         failed = np.zeros(self.num_robots, dtype=bool)
-        force = np.zeros((self.num_robots, 5))
         reached = self._reached_at >= 0
         for _ in range(c.decimation):
             self._executor.step(commands)
             ended = outcome(loco.world, self.goal)
             failed |= has_failed(ended)
             reached |= (ended == REACHED) & ~failed
-            state = loco.world.state
-            now = np.column_stack([state.trunk_force, state.leg_force])
-            np.maximum(force, now, out=force)
+            self.rewards.measure(loco.world.state)
         self._observer.measure(self.goal)
         if self.teacher is not None:
             self.teacher.watch(loco, self.step_seconds)
         self.elapsed += 1
         first = reached & (self._reached_at < 0)
         self._reached_at[first] = self.elapsed[first]
-        seen = high_step(
-            loco,
-            self.goal,
-            self.elapsed / self.horizon,
-            self._actions,
-            self._commands,
-            force,
-            c.rewards,
-        )
-        terms = rewards.high_terms(seen, self.step_seconds)
+        terms = self.rewards.terms(loco, self.goal, self.elapsed / self.horizon)
         reward = np.sum(list(terms.values()), axis=0)
         held = reached & (self.elapsed - self._reached_at >= self._hold_decisions)
         truncated = ~failed & (held | (self.elapsed >= self.horizon))
@@ -272,7 +209,7 @@ class NavigationTask:
     def observe(self) -> NDArray[np.float32]:
         """o^H, (M, n), followed by the guidance, (M, ``GUIDANCE``), if there is a teacher."""
         seen = self._observer.observe(
-            self.goal, self.elapsed / self.horizon, self._actions[0], self.family_index
+            self.goal, self.elapsed / self.horizon, self.rewards.actions[0], self.family_index
         )
         if self.teacher is None:
             return seen
@@ -347,8 +284,8 @@ class NavigationTask:
                 "elapsed": self.elapsed,
                 "reached_at": self._reached_at,
                 "next_push": self._next_push,
-                "actions": self._actions,
-                "commands": self._commands,
+                "actions": self.rewards.actions,
+                "commands": self.rewards.commands,
                 "led": self._led,
                 "untold": self._untold,
                 "taught": self._taught,

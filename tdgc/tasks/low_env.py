@@ -22,16 +22,16 @@ from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, draw_start_goal
 from tdgc.state import State, copies, fill
-from tdgc.tasks import rewards
 from tdgc.tasks.command_draw import PRONK, CommandDraw
 from tdgc.tasks.crossings import Crossings
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, CriticSources, low_spaces
+from tdgc.tasks.low_rewards import LowStep, low_terms, total
 from tdgc.tasks.low_statistics import by_gait
 from tdgc.tasks.pushes import Pushes
-from tdgc.tasks.rules import is_fallen
+from tdgc.tasks.rules import episode_steps, is_fallen
 from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.tiles import FLAT, TrainingTiles, shallow
@@ -77,9 +77,9 @@ class LowLevelTask:
         self.num_robots = m = num_robots
         self.training = training
         self.rng = np.random.default_rng(seed)
-        self.horizon = round(config.episode_seconds / config.physics.control_dt)
+        self.horizon = episode_steps(config.episode_seconds, config.physics.control_dt)
         self._command_steps = round(config.command_seconds / config.physics.control_dt)
-        self.level = self.rng.integers(0, min(config.first_levels, config.levels), m)
+        self.level = self.rng.integers(0, config.first_levels, m)
         self.column = (first + np.arange(m)) % len(config.families)
         on_tiles = config.terrain == "tiles"
         families = [config.families[c] if on_tiles else FLAT for c in self.column]
@@ -176,14 +176,14 @@ class LowLevelTask:
         e.elapsed += 1
         self.crossings.learn_landing(loco, clock)
         self.ground = measure_ground(loco)
-        terms = rewards.low_terms(self._low_step(speed), c.rewards)
-        reward = rewards.total(terms, c.rewards, c.physics.control_dt, self._penalty())
+        terms = low_terms(self._low_step(speed), c.rewards)
+        reward = total(terms, c.rewards, c.physics.control_dt, self._penalty())
         terminated = is_fallen(loco.world)
         truncated = ~terminated & ((e.elapsed >= self.horizon) | self._left_tile() | e.reached)
         self._count(terms, reward, terminated)
         e.tilts[:] = np.roll(e.tilts, 1, axis=1)
         e.tilts[:, 0] = loco.world.state.gravity[:, :2]
-        e.was_contact[:] = loco.world.state.foot_force > rewards.CONTACT_FORCE
+        e.was_contact[:] = loco.world.state.touching
         if self.training:
             # A failed retry is not remembered again: retried until they succeed, a few hopeless
             # commands would soon be the only ones left.
@@ -223,10 +223,10 @@ class LowLevelTask:
 
     # ------------------------------------------------------------------ reward, observation
 
-    def _low_step(self, speed_before: Array) -> rewards.LowStep:
+    def _low_step(self, speed_before: Array) -> LowStep:
         loco, c = self.locomotion, self.config
         command = loco.executed()
-        return rewards.LowStep(
+        return LowStep(
             state=loco.world.state,
             command=command,
             phases=loco.clock.phases,

@@ -10,7 +10,6 @@ from tdgc.sim.locomotion import GYRO_SCALE, Locomotion, actor_layout
 from tdgc.sim.observation import ARROW, JOINTS, LEGS, TURN, Flip, Term, mirror, width
 from tdgc.sim.robot import NUM_JOINTS, Array
 from tdgc.tasks.ground import GROUND_PROBES, Ground
-from tdgc.tasks.rewards import CONTACT_FORCE
 
 if TYPE_CHECKING:
     from tdgc.policies import Mirror
@@ -47,7 +46,7 @@ CRITIC_LAYOUT: tuple[Term[CriticSources], ...] = (
     Term("angular_velocity", 3, lambda s: s.loco.world.state.body_rate, GYRO_SCALE, mirror=TURN),
     Term("base_height", 1, lambda s: (s.ground.base - s.loco.robot.base_height)[:, None], 10.0),
     Term("foot_height", 4, lambda s: s.ground.feet, 10.0, mirror=LEGS),
-    Term("foot_contact", 4, lambda s: s.loco.world.state.foot_force > CONTACT_FORCE, mirror=LEGS),
+    Term("foot_contact", 4, lambda s: s.loco.world.state.touching, mirror=LEGS),
     Term("desired_contact", 4, lambda s: s.loco.clock.contact, mirror=LEGS),
     Term("dynamics", 6, _dynamics),
     Term("terrain", 15, lambda s: np.clip(s.ground.probes, -0.5, 0.5), 5.0, mirror=_PROBES),

@@ -8,7 +8,6 @@ from tdgc.sim.commands import INDEX, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.tasks.rewards import CONTACT_FORCE
 from tdgc.tasks.statistics import mean_rewards
 
 
@@ -20,12 +19,11 @@ def by_gait(loco: Locomotion, terms: Mapping[str, Array]) -> dict[str, Array]:
     ``track_lin_vel`` and ``track_yaw_rate``: these reward ``terms``, 0 if switched off.
     """
     state, nothing = loco.world.state, np.zeros(loco.num_robots)
-    in_contact, wanted = state.foot_force > CONTACT_FORCE, loco.clock.contact > 0.5
     samples = {
         "steps": np.ones(loco.num_robots),
         "lin": np.sum((state.heading_vel[:, :2] - loco.command[:, :2]) ** 2, axis=1),
         "yaw": (state.ang_vel[:, 2] - loco.command[:, INDEX["yaw_rate"]]) ** 2,
-        "match": np.mean(in_contact == wanted, axis=1),
+        "match": np.mean(state.touching == (loco.clock.contact > 0.5), axis=1),
         "track_lin_vel": terms.get("track_lin_vel", nothing),
         "track_yaw_rate": terms.get("track_yaw_rate", nothing),
     }

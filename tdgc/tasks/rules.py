@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from tdgc.config import ConfigError
 from tdgc.sim.robot import Array
 from tdgc.sim.world import World
 
@@ -15,6 +16,17 @@ HORIZON = 20.0  # s (TDGC-Bench)
 OUTCOMES = ("reached", "fell", "collided", "left_tile", "timeout")
 REACHED, FELL, COLLIDED, LEFT_TILE, TIMEOUT = range(len(OUTCOMES))
 GOING = -1
+
+
+def episode_steps(seconds: float, step: float) -> int:
+    """Number of steps of ``step`` s in an episode of ``seconds``.
+
+    Raises:
+        ConfigError: not a single one.
+    """
+    if round(seconds / step) < 1:
+        raise ConfigError(f"'env.episode_seconds' must last a step of {step:g} s, not {seconds:g}")
+    return round(seconds / step)
 
 
 def outcome(
@@ -30,7 +42,7 @@ def outcome(
         goal: (M, 2) m in the world; only the horizontal distance counts. None: nothing is reached.
         time_is_up: (M,), or a single value for all robots.
     """
-    x, y, z = world.state.position.T
+    x, y = world.state.position[:, :2].T
     ended = np.where(time_is_up, TIMEOUT, np.full(len(x), GOING))
     if goal is not None:
         ended[np.hypot(*(world.state.position[:, :2] - goal).T) < GOAL_RADIUS] = REACHED
@@ -38,7 +50,7 @@ def outcome(
         ended[~world.field.on_tile(np.arange(len(x)), 0, x, y)] = LEFT_TILE
     ended[world.state.trunk_force > TRUNK_FORCE] = COLLIDED
     # So written that a robot whose simulation has blown up, at NaN, has fallen as well.
-    ended[~(z - world.support_height(x, y) >= FALL_HEIGHT)] = FELL
+    ended[~(world.trunk_height() >= FALL_HEIGHT)] = FELL
     return ended
 
 

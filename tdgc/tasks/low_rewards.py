@@ -1,8 +1,8 @@
-"""Reward terms, each a pure function on arrays of M robots, and the tables that list them.
+"""The low policy's reward terms (Sec. IV-A), each a pure function on arrays of M robots.
 
-Low policy (Sec. IV-A): the terms of Walk These Ways that the paper names or needs. A term returns
-the raw quantity, (M,); its sign and weight come from ``LowRewardConfig``. ``total`` combines them
-as Walk These Ways does, so that a good gait multiplies the tracking reward:
+They are the terms of Walk These Ways that the paper names or needs. A term returns the raw
+quantity, (M,); its sign and weight come from ``LowRewardConfig``. ``total`` combines them as Walk
+These Ways does, so that a good gait multiplies the tracking reward:
 
     R = dt * (sum of positive terms) * exp(sum of negative terms)
 """
@@ -13,12 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdgc.config import HighRewardConfig, LowRewardConfig
+from tdgc.config import LowRewardConfig
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.geometry import FRONT, SIDE
 from tdgc.sim.robot import Array, RobotState, foot_travel
 
-CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact
 _SOFT_LIMIT = 0.9  # share of a joint's range without a penalty (Walk These Ways)
 _FORCE_SCALE = 100.0  # N^2, swing contact force (Walk These Ways)
 _SPEED_SCALE = 10.0  # m^2/s^2, stance foot speed (Walk These Ways)
@@ -69,13 +68,14 @@ class LowStep:
         return np.asarray(self.command[:, INDEX[name]])
 
 
-def _square_sum(x: Array) -> Array:
+def square_sum(x: Array) -> Array:
+    """Sum of squares along the last axis, (..., n) -> (...)."""
     return np.asarray(np.einsum("...i,...i->...", x, x))
 
 
 def track_lin_vel(s: LowStep) -> Array:
     """r_lin = exp(-|v_xy - v_xy^cmd|^2 / sigma_lin), velocities in the heading frame."""
-    return np.exp(-_square_sum(s.state.heading_vel[:, :2] - s.command[:, :2]) / s.sigma_lin)
+    return np.exp(-square_sum(s.state.heading_vel[:, :2] - s.command[:, :2]) / s.sigma_lin)
 
 
 def track_yaw_rate(s: LowStep) -> Array:
@@ -98,7 +98,7 @@ def commanded_gravity(pitch: Array, roll: Array) -> Array:
 def orientation(s: LowStep) -> Array:
     """Squared xy error of the projected gravity against the commanded pitch and roll."""
     wanted = commanded_gravity(s.cmd("pitch"), s.cmd("roll"))
-    return _square_sum((s.state.gravity - wanted)[:, :2])
+    return square_sum((s.state.gravity - wanted)[:, :2])
 
 
 def raibert_targets(command: Array, phases: Array, stance: tuple[float, float]) -> Array:
@@ -137,29 +137,29 @@ def swing_contact_force(s: LowStep) -> Array:
 
 def stance_foot_speed(s: LowStep) -> Array:
     """Motion in stance: mean of C (1 - exp(-|v_foot|^2 / 10 m^2/s^2))."""
-    speed2 = _square_sum(s.state.foot_velocity)
+    speed2 = square_sum(s.state.foot_velocity)
     return np.mean(s.contact * (1.0 - np.exp(-speed2 / _SPEED_SCALE)), axis=1)
 
 
 def target_rate(s: LowStep) -> Array:
     """First difference of the joint targets, squared, rad^2 (smoothness 1)."""
-    return _square_sum(s.targets[0] - s.targets[1])
+    return square_sum(s.targets[0] - s.targets[1])
 
 
 def target_acceleration(s: LowStep) -> Array:
     """Second difference of the joint targets, squared, rad^2 (smoothness 2)."""
-    return _square_sum(s.targets[0] - 2.0 * s.targets[1] + s.targets[2])
+    return square_sum(s.targets[0] - 2.0 * s.targets[1] + s.targets[2])
 
 
 def action_rate(s: LowStep) -> Array:
     """First difference of the raw actions, squared."""
-    return _square_sum(s.actions[0] - s.actions[1])
+    return square_sum(s.actions[0] - s.actions[1])
 
 
 def foot_slip(s: LowStep) -> Array:
     """Squared horizontal speed of feet in contact now or a step ago, summed, m^2/s^2."""
-    touching = np.logical_or(s.state.foot_force > CONTACT_FORCE, s.was_contact)
-    return np.sum(touching * _square_sum(s.state.foot_velocity[..., :2]), axis=1)
+    touching = np.logical_or(s.state.touching, s.was_contact)
+    return np.sum(touching * square_sum(s.state.foot_velocity[..., :2]), axis=1)
 
 
 def leg_collision(s: LowStep) -> Array:
@@ -182,27 +182,27 @@ def vertical_velocity(s: LowStep) -> Array:
 
 def tilt_rate(s: LowStep) -> Array:
     """Squared roll and pitch rate of the trunk, rad^2/s^2."""
-    return _square_sum(s.state.body_rate[:, :2])
+    return square_sum(s.state.body_rate[:, :2])
 
 
 def nodding(s: LowStep) -> Array:
     """Squared change, within one gait cycle, of the xy of unit gravity in the trunk's frame."""
-    return _square_sum(s.state.gravity[:, :2] - s.last_tilt)
+    return square_sum(s.state.gravity[:, :2] - s.last_tilt)
 
 
 def joint_torques(s: LowStep) -> Array:
     """Squared joint torques, summed, N^2 m^2."""
-    return _square_sum(s.state.torque)
+    return square_sum(s.state.torque)
 
 
 def joint_speeds(s: LowStep) -> Array:
     """Squared joint speeds, summed, rad^2/s^2."""
-    return _square_sum(s.state.qd)
+    return square_sum(s.state.qd)
 
 
 def joint_accelerations(s: LowStep) -> Array:
     """Squared joint accelerations, summed, rad^2/s^4."""
-    return _square_sum(s.acceleration)
+    return square_sum(s.acceleration)
 
 
 def power(s: LowStep) -> Array:
@@ -267,132 +267,3 @@ def total(
         else:
             negative = negative + value
     return np.asarray(dt * positive * np.exp(penalty * negative))
-
-
-# ---------------------------------------------------------------------------- high policy
-
-
-@dataclass
-class HighStep:
-    """Inputs of the high policy's terms for one decision of M robots (Sec. IV-B).
-
-    Attributes:
-        distance: (M,) m to the goal, d_t, horizontal: a goal has no height here.
-        heading_error: (M,) rad, psi* - psi.
-        time_share: (M,) t / T_max.
-        lin_vel, ang_vel: (M, 3) of the base, m/s and rad/s; joint_speed: (M, 12) rad/s.
-        base_height: (M,) m above ground; standing_height: m, z*.
-        actions: (2, M, 13), this action and the one before, clipped and normalised.
-        commands: (3, M, 15) of this decision and the two before, each as a share of its range.
-        contact_forces: (M, 5) N: the trunk, and each leg above the foot.
-        config: the constants.
-    """
-
-    distance: Array
-    heading_error: Array
-    time_share: Array
-    lin_vel: Array
-    ang_vel: Array
-    joint_speed: Array
-    base_height: Array
-    standing_height: float
-    actions: Array
-    commands: Array
-    contact_forces: Array
-    config: HighRewardConfig
-
-    @property
-    def inside(self) -> Array:
-        """1[d_t < d_0], (M,)."""
-        return (self.distance < self.config.goal_radius).astype(np.float64)
-
-
-def goal_distance(s: HighStep) -> Array:
-    """r_goal_dist = p + a (1 - e^{-b p}), p = clip(1 - d_t / R_map, 0, 1)."""
-    p = np.clip(1.0 - s.distance / s.config.map_radius, 0.0, 1.0)
-    return p + s.config.curve_gain * (1.0 - np.exp(-s.config.curve_rate * p))
-
-
-def face(s: HighStep) -> Array:
-    """r_face = cos(psi* - psi)."""
-    return np.cos(s.heading_error)
-
-
-def arrive(s: HighStep) -> Array:
-    """r_arrive = 1[d_t < d_0] (b_0 + b_1 alpha), alpha = clip(1 - t / T_max, 0, 1)."""
-    alpha = np.clip(1.0 - s.time_share, 0.0, 1.0)
-    return s.inside * (s.config.arrive_base + s.config.arrive_speed * alpha)
-
-
-def stable(s: HighStep) -> Array:
-    """r_stable = 1[d_t < d_0] exp(-eta_t) exp(-(z - z*)^2 / sigma_z)."""
-    eta = (
-        np.linalg.norm(s.lin_vel, axis=1)
-        + np.linalg.norm(s.ang_vel, axis=1)
-        + s.config.joint_speed_weight * np.linalg.norm(s.joint_speed, axis=1)
-    )
-    height = (s.base_height - s.standing_height) ** 2 / s.config.height_scale
-    return s.inside * np.exp(-eta) * np.exp(-height)
-
-
-def high_action_rate(s: HighStep) -> Array:
-    """r_action_rate = sum_j (a_t - a_{t-1})^2."""
-    return _square_sum(s.actions[0] - s.actions[1])
-
-
-def command_rate(s: HighStep) -> Array:
-    """r_cmd_sm1: mean squared first difference of the commands."""
-    return _square_sum(s.commands[0] - s.commands[1]) / s.commands.shape[-1]
-
-
-def command_acceleration(s: HighStep) -> Array:
-    """r_cmd_sm2: mean squared second difference of the commands."""
-    second = s.commands[0] - 2.0 * s.commands[1] + s.commands[2]
-    return _square_sum(second) / s.commands.shape[-1]
-
-
-def contact_force(s: HighStep) -> Array:
-    """r_col = sum_j max(0, |F_j| - F_th), over the trunk and the legs above the feet."""
-    return np.sum(np.maximum(s.contact_forces - s.config.force_threshold, 0.0), axis=1)
-
-
-def laziness(s: HighStep) -> Array:
-    """r_lazy = 1[d_t > d_0] 1[|v| < v_th]."""
-    slow = np.linalg.norm(s.lin_vel, axis=1) < s.config.lazy_speed
-    return (1.0 - s.inside) * slow
-
-
-def alive(s: HighStep) -> Array:
-    """r_alive = 1."""
-    return np.ones_like(s.distance)
-
-
-#: Terms of the high policy by the name of their weight in ``HighRewardConfig``.
-HIGH_TERMS: dict[str, Callable[[HighStep], Array]] = {
-    "goal_distance": goal_distance,
-    "face": face,
-    "arrive": arrive,
-    "stable": stable,
-    "action_rate": high_action_rate,
-    "command_rate": command_rate,
-    "command_acceleration": command_acceleration,
-    "contact_force": contact_force,
-    "laziness": laziness,
-    "alive": alive,
-}
-if not set(HIGH_TERMS) <= {f.name for f in dataclasses.fields(HighRewardConfig)}:
-    raise TypeError("HIGH_TERMS names a term without a weight in HighRewardConfig")
-
-
-def high_terms(step: HighStep, dt: float) -> dict[str, Array]:
-    """Every enabled term times its effective weight, (M,) each.
-
-    The effective weight is w_i dt (step-time scaling), or w_i without ``step_time_scaling``. The
-    high policy's reward is the plain sum of these terms.
-    """
-    scale = dt if step.config.step_time_scaling else 1.0
-    return {
-        name: weight * scale * term(step)
-        for name, term in HIGH_TERMS.items()
-        if (weight := getattr(step.config, name)) != 0.0
-    }

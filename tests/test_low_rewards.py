@@ -1,4 +1,4 @@
-"""Every reward term in states worked out by hand, and how terms combine into a reward."""
+"""Every reward term of the low policy in states worked out by hand, and how terms combine."""
 
 import dataclasses
 import math
@@ -7,21 +7,13 @@ import numpy as np
 import pybullet
 import pytest
 
-from tdgc.config import HighRewardConfig, LowRewardConfig, RobotConfig
+from tdgc.config import LowRewardConfig, RobotConfig
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import desired_contact, gait_embedding, swing_profile
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import Array, RobotState, foot_kinematics, nominal_pose
-from tdgc.tasks import rewards
-from tdgc.tasks.rewards import (
-    HIGH_TERMS,
-    LOW_TERMS,
-    HighStep,
-    LowStep,
-    high_terms,
-    low_terms,
-    total,
-)
+from tdgc.tasks import low_rewards as rewards
+from tdgc.tasks.low_rewards import LOW_TERMS, LowStep, low_terms, total
 
 E = math.exp
 GEOMETRY = read_geometry(RobotConfig())
@@ -389,72 +381,3 @@ def test_desired_contact_of_a_trot_weighs_the_diagonal_in_swing() -> None:
     step.command[:, 12:] = gait_embedding(0)
     step.state.foot_force[1] = [100.0, 0.0, 0.0, 100.0]
     np.testing.assert_allclose(rewards.swing_contact_force(step), [0.0, 0.5], atol=1e-3)
-
-
-# ------------------------------------------------------------------ high policy
-
-
-def high_step(**changes: object) -> HighStep:
-    """Two robots at rest, 4 m from the goal and facing it, halfway through the episode."""
-    step = HighStep(
-        distance=np.full(2, 4.0),
-        heading_error=np.zeros(2),
-        time_share=np.full(2, 0.5),
-        lin_vel=np.zeros((2, 3)),
-        ang_vel=np.zeros((2, 3)),
-        joint_speed=np.zeros((2, 12)),
-        base_height=np.full(2, 0.30),
-        standing_height=0.30,
-        actions=np.zeros((2, 2, 13)),
-        commands=np.zeros((3, 2, 15)),
-        contact_forces=np.zeros((2, 5)),
-        config=HighRewardConfig(),
-    )
-    return dataclasses.replace(step, **changes)  # type: ignore[arg-type]
-
-
-def test_goal_distance_and_face() -> None:
-    step = high_step(distance=np.array([4.0, 9.0]), heading_error=np.array([0.0, 2.0]))
-    np.testing.assert_allclose(rewards.goal_distance(step), [0.5 + 1 - E(-1.5), 0.0], atol=1e-12)
-    np.testing.assert_allclose(rewards.face(step), [1.0, math.cos(2.0)], atol=1e-12)
-    there = high_step(distance=np.zeros(2))
-    np.testing.assert_allclose(rewards.goal_distance(there), [2.0 - E(-3.0)] * 2, atol=1e-12)
-
-
-def test_arrive_and_stable() -> None:
-    step = high_step(distance=np.array([0.5, 0.49]), time_share=np.array([0.1, 0.25]))
-    step.lin_vel[1], step.ang_vel[1] = [0.3, 0.0, 0.4], [0.0, 0.0, -0.2]
-    step.joint_speed[1, 0] = 2.0
-    step.base_height[1] = 0.35
-    np.testing.assert_allclose(rewards.arrive(step), [0.0, 2.5], atol=1e-12)
-    np.testing.assert_allclose(rewards.stable(step), [0.0, E(-0.8) * E(-0.25)], atol=1e-12)
-    late = high_step(distance=np.zeros(2), time_share=np.array([1.0, 1.5]))
-    assert rewards.arrive(late).tolist() == [1.0, 1.0]
-
-
-def test_differences_of_actions_and_commands() -> None:
-    step = high_step()
-    step.actions[0, 1, :2] = [1.0, -0.5]
-    step.commands[0, 1, 0], step.commands[1, 1, 0], step.commands[2, 1, 0] = 0.9, 0.3, 0.0
-    np.testing.assert_allclose(rewards.high_action_rate(step), [0.0, 1.25], atol=1e-12)
-    np.testing.assert_allclose(rewards.command_rate(step), [0.0, 0.36 / 15], atol=1e-12)
-    np.testing.assert_allclose(rewards.command_acceleration(step), [0.0, 0.09 / 15], atol=1e-12)
-
-
-def test_contact_laziness_and_alive() -> None:
-    step = high_step(distance=np.array([4.0, 0.4]))
-    step.contact_forces[1] = [41.0, 0.5, 1.0, 3.0, 0.0]
-    assert rewards.contact_force(step).tolist() == [0.0, 42.0]
-    assert rewards.laziness(step).tolist() == [1.0, 0.0]
-    step.lin_vel[0] = [0.0, 0.06, 0.08]  # not below 0.1 m/s
-    assert rewards.laziness(step).tolist() == [0.0, 0.0]
-    assert rewards.alive(step).tolist() == [1.0, 1.0]
-
-
-def test_high_terms_are_scaled_by_the_duration_of_a_step() -> None:
-    config = dataclasses.replace(high_step().config, alive=0.5, face=0.2, laziness=0.0)
-    terms = high_terms(high_step(config=config), 0.1)
-    assert set(HIGH_TERMS) - set(terms) == {"laziness"}
-    np.testing.assert_allclose(terms["alive"], [0.05, 0.05], atol=1e-15)
-    np.testing.assert_allclose(terms["face"], [0.02, 0.02], atol=1e-15)
-    assert set(HIGH_TERMS) <= {f.name for f in dataclasses.fields(HighRewardConfig)}
