@@ -308,7 +308,7 @@ def test_a_file_holds_the_trace_and_says_what_it_is(watched, tmp_path):
         assert (about["unit"], about["description"]) == (c.unit, c.meaning)
         assert schema.field(c.name).type in (pa.float32(), pa.string())  # scalars only
     meta = {k.decode(): v.decode() for k, v in schema.metadata.items()}
-    assert meta["format"] == "tdgc-trace" and meta["version"] == "3"
+    assert meta["format"] == "tdgc-trace" and meta["version"] == "4"
     assert (meta["outcome"], meta["seed"], meta["episode"]) == (t.outcome, "5", "3")
     assert pq.read_table(path)["command_vx"].null_count == 1  # the end has no decision
 
@@ -328,7 +328,7 @@ def test_files_that_are_no_traces_are_refused(watched, tmp_path):
     table = pq.read_table(path)
     meta = table.schema.metadata
     pq.write_table(table.replace_schema_metadata(meta | {b"version": b"1"}), other)
-    with pytest.raises(TraceError, match=r"a trace of version 1, this package reads 3$"):
+    with pytest.raises(TraceError, match=r"a trace of version 1, this package reads 4$"):
         trace.read(other)
     moved = table.schema.field("probe_00").with_metadata({"unit": "m", "description": "elsewhere"})
     place = table.schema.get_field_index("probe_00")
@@ -338,7 +338,7 @@ def test_files_that_are_no_traces_are_refused(watched, tmp_path):
         table.cast(table.schema.set(place, moved)),
     ):
         pq.write_table(wrong, other)
-        with pytest.raises(TraceError, match=r"columns are not those of a trace of version 3$"):
+        with pytest.raises(TraceError, match=r"columns are not those of a trace of version 4$"):
             trace.read(other)
     lacking = {k: v for k, v in meta.items() if k != b"seed"}
     pq.write_table(table.replace_schema_metadata(lacking), other)

@@ -31,7 +31,7 @@ from tdgc.tasks.probes import NUM_PROBES, PROBES
 from tdgc.tasks.rules import episode_steps
 
 FORMAT = "tdgc-trace"
-VERSION = 3
+VERSION = 4
 
 
 class TraceError(InputError):
@@ -62,32 +62,32 @@ def _columns() -> Iterator[Column]:
     yield Column("base_y", "m", "trunk across the tile, 0 at its right border")
     yield Column("base_z", "m", "trunk above the platforms")
     yield Column("base_height", "m", "trunk above the support surface under it")
-    yield Column("yaw", "rad", "heading, 0 along the tile, to the left positive")
+    yield Column("yaw", "rad", "heading, 0 along the tile, left positive")
     yield Column("pitch", "rad", "of the trunk, nose down positive")
     yield Column("roll", "rad", "of the trunk, left side up positive")
     yield Column("goal_distance", "m", "from the trunk to the goal")
-    yield Column("goal_bearing", "rad", "of the goal against the heading, to the left positive")
-    yield Column("family", "", "cue: the terrain family that the high policy was told")
+    yield Column("goal_bearing", "rad", "of the goal relative to the heading, left positive")
+    yield Column("family", "", "cue: terrain family reported to the high policy")
     for i, name in enumerate(_PROBES):
-        meaning = f"cue: ground under probe {i}, against where a standing robot's would be"
+        meaning = f"cue: ground at probe {i}, relative to the ground under a standing robot"
         yield Column(name, "m", meaning)
     for name in _ACTIONS:
-        yield Column(name, "1", "action of the policy, before it is decoded")
+        yield Column(name, "1", "action of the policy, before decoding")
     for name, unit in zip(NAMES, UNITS, strict=True):
-        yield Column(f"command_{name}", unit, "command, as it was carried out")
+        yield Column(f"command_{name}", unit, "command, as executed")
     unit = UNITS[INDEX["frequency"]]
-    yield Column("asked_frequency", unit, "command, as it was asked for")
+    yield Column("asked_frequency", unit, "command, as requested")
     yield Column("gait", "", "gait commanded")
     for name in CONTINUOUS:
-        yield Column(f"at_bound_{name}", "1", "-1 or 1: at its lower or upper bound")
-    yield Column("seconds", "s", "since the decision before; the columns below look back on them")
+        yield Column(f"at_bound_{name}", "1", "-1 or 1 if at its lower or upper bound, else 0")
+    yield Column("seconds", "s", "since the previous decision, which the columns below describe")
     for name in TRACKED:
         unit = UNITS[INDEX[name]]
-        yield Column(f"error_{name}", unit, "mean of what was measured less what was commanded")
+        yield Column(f"error_{name}", unit, "mean of measured minus commanded")
     for foot in FEET:
         yield Column(f"contact_{foot}", "1", "share of the time in contact")
     for foot in FEET:
-        yield Column(f"match_{foot}", "1", "share of the time in contact as the gait desired")
+        yield Column(f"match_{foot}", "1", "share of the time with contact as the gait schedules")
     yield Column("trunk_force", "N", "largest normal force on the trunk")
     yield Column("leg_force", "N", "largest normal force on a leg above its foot")
     yield Column("power", "W", "mean of the sum of |torque x speed| of the joints")
