@@ -17,7 +17,7 @@ import json
 import shutil
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,16 +27,31 @@ import torch as th
 
 from tdgc import __version__
 from tdgc.benchmark.drivers import HierarchyDriver, load_high
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, RobotConfig
+from tdgc.config import (
+    CommandRanges,
+    ConfigError,
+    HighLevelConfig,
+    LowLevelConfig,
+    PhysicsConfig,
+    RobotConfig,
+)
 from tdgc.deploy.controller import FORMATS, Controller, quiet
 from tdgc.deploy.graphs import HighGraph, LowGraph, Signal
 from tdgc.deploy.interface import VERSION, Table, interface_path
 from tdgc.errors import require
 from tdgc.files import checksum, write_text
 from tdgc.policies import Policy
-from tdgc.sim.commands import CONTINUOUS, NAMES, UNITS, CommandDecoder, default_command
+from tdgc.sim.commands import (
+    CONTINUOUS,
+    INDEX,
+    NAMES,
+    UNITS,
+    CommandDecoder,
+    command_bounds,
+    default_command,
+)
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
-from tdgc.sim.geometry import read_geometry
+from tdgc.sim.geometry import Geometry, read_geometry
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
@@ -44,7 +59,7 @@ from tdgc.sim.terrain import TileField, make_tile
 from tdgc.sim.urdf import JOINTS, mesh_path, read_urdf
 from tdgc.sim.world import World
 from tdgc.tasks.high_observation import SEMANTIC
-from tdgc.tasks.pairing import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, VELOCITIES, load_low
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.rules import GOAL_RADIUS, GOING, outcome
 
@@ -55,6 +70,44 @@ TOLERANCE = 1e-5
 # The extra `export` of setup.cfg; all but the first are only needed for the format onnx.
 _PACKAGES = ("jsonschema", "onnx", "onnxruntime", "onnxscript")
 _CHECKED_ON = "rough"  # a family on which every step differs from the previous one
+
+
+#: What each command asks for and which direction is positive, in the order of ``NAMES``.
+_MEANINGS = (
+    "velocity ahead, in the frame that turns by yaw alone",
+    "velocity to the left, in the same frame",
+    "positive turns left",
+    "added to the standing height",
+    "gait cycles per second",
+    "duty factor: share of the cycle that a foot spends in stance",
+    "apex of a swing foot above the ground",
+    "positive is nose down",
+    "positive is left side up",
+    *(
+        f"between {feet} footholds; {default_command()[INDEX[name]]:g} is the robot's own stance"
+        for name, feet in (("stance_width", "left and right"), ("stance_length", "front and rear"))
+    ),
+    "price of mechanical power in training",
+    "share of a cycle between diagonal pairs of feet: 0.5 in trot",
+    "share of a cycle between front and rear pair: 0.5 in the gait bound",
+    "share of a cycle between left and right pair: 0.5 in pace",
+)
+#: Unit and meaning of what ``RandomisationConfig`` draws, by its names.
+_DRAWN = {
+    "friction": ("1", "coefficient of friction, feet on ground"),
+    "payload": ("kg", "added to the trunk"),
+    "motor_strength": ("1", "factor on torque limits and gains"),
+    "joint_offset": ("rad", "error of each joint's zero"),
+    "armature": ("kg m^2", "rotor inertia about each joint"),
+    "joint_friction": ("N m", "dry friction of each joint"),
+    "latency": ("s", "from joint targets to their effect"),
+    "push_speed": ("m/s", "sudden change of the trunk's velocity, in any horizontal direction"),
+    "noise_gravity": ("1", "error of each entry of 'gravity' in each step"),
+    "noise_joint_angle": ("rad", "error of each entry of 'joint_angles' in each step"),
+    "noise_joint_speed": ("rad/s", "error of each entry of 'joint_speeds' in each step"),
+    "noise_gyro": ("rad/s", "error of each entry of 'gyro' in each step"),
+    "noise_probes": ("m", "error of each entry of 'probes' in each decision"),
+}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -94,18 +147,16 @@ def interfaces(pair: Pair, low: LowGraph, high: HighGraph, urdf: Path) -> dict[s
 
     Their schema is ``tdgc/deploy/interface.schema.json``; ``urdf`` is the exported folder's copy.
     """
-    config, task = pair.low_config, pair.high_config
-    robot, physics = config.robot, config.physics
-    geometry = read_geometry(robot)
-    joint_hz = physics.joint_steps / physics.control_dt
-    gaits = [
-        {"name": gait, **dict(zip(NAMES[12:], row, strict=True))}
-        for gait, row in zip(GAITS, GAIT_TABLE.tolist(), strict=True)
-    ]
-    low_table = _head("low", pair.low, low, 1.0 / physics.control_dt) | {
-        "joints": JOINTS,
+    return {"low": _low_table(pair, low, urdf), "high": _high_table(pair, high)}
+
+
+def _low_table(pair: Pair, graph: LowGraph, urdf: Path) -> Table:
+    config = pair.low_config
+    robot, geometry = config.robot, read_geometry(config.robot)
+    terms = actor_layout(robot, config.gyro)
+    return _head("low", pair.low, graph, 1.0 / config.physics.control_dt) | {
         "commands": _commands(config.commands),
-        "gaits": gaits,
+        "trained_for": _trained_for(config, config.physics, {term.noise for term in terms}),
         "feet": FEET,
         "frames": {
             "trunk": "ahead, left, up",
@@ -117,65 +168,82 @@ def interfaces(pair: Pair, low: LowGraph, high: HighGraph, urdf: Path) -> dict[s
             "link_masses": _quantity("kg", geometry.masses),
             "total_mass": _quantity("kg", sum(geometry.masses.values())),
             "standing_height": _quantity("m", robot.base_height),
+            "stance": {"unit": "m"} | dict(zip(("length", "width"), robot.stance, strict=True)),
         },
         "start": {
             "joint_angles": _quantity("rad", nominal_pose(robot).tolist()),
             "trunk_height": _quantity("m", nominal_height(robot, geometry)),
         },
-        "joint_control": {
-            "law": "torque = kp (target - angle) - kd speed, within the torque limit; 0 where it "
-            "would drive a joint beyond its speed limit",
-            "axes": "right-handed: hips about the axis ahead, thighs and calves about the one to "
-            "the left; at 0 a leg is straight down",
-            "rate": _quantity("Hz", joint_hz),
-            "kp": _quantity("N m/rad", [robot.kp] * NUM_JOINTS),
-            "kd": _quantity("N m s/rad", [robot.kd] * NUM_JOINTS),
-            "torque_limit": _quantity("N m", robot.torque_limit * 4),
-            "speed_limit": _quantity("rad/s", robot.speed_limit * 4),
-            "simulated_speed_limit": _quantity("rad/s", [min(robot.speed_limit)] * NUM_JOINTS),
-            "joint_limits": {
-                "unit": "rad",
-                "low": geometry.joint_limits[:, 0].tolist(),
-                "high": geometry.joint_limits[:, 1].tolist(),
-            },
-            "target_margin": _quantity("rad", robot.joint_margin),
-        },
+        "joint_control": _joint_control(robot, geometry, config.physics),
     }
-    step = task.decimation * physics.control_dt
-    high_table = _head("high", pair.high, high, 1.0 / step) | {
-        "order": [{"graph": "high", "every": task.decimation}, {"graph": "low", "every": 1}],
-        "joints": JOINTS,
-        "commands": _commands(task.commands or config.commands),
-        "gaits": gaits,
+
+
+def _joint_control(robot: RobotConfig, geometry: Geometry, physics: PhysicsConfig) -> Table:
+    return {
+        "law": "torque = kp (target - angle) - kd speed, within the torque limit; 0 where it "
+        "would drive a joint beyond its speed limit",
+        "axes": "right-handed: hips about the axis ahead, thighs and calves about the one to "
+        "the left; at 0 a leg is straight down",
+        "rate": _quantity("Hz", physics.joint_steps / physics.control_dt),
+        "kp": _quantity("N m/rad", [robot.kp] * NUM_JOINTS),
+        "kd": _quantity("N m s/rad", [robot.kd] * NUM_JOINTS),
+        "torque_limit": _quantity("N m", robot.torque_limit * 4),
+        "speed_limit": _quantity("rad/s", robot.speed_limit * 4),
+        "simulated_speed_limit": _quantity("rad/s", [min(robot.speed_limit)] * NUM_JOINTS),
+        "joint_limits": {
+            "unit": "rad",
+            "low": geometry.joint_limits[:, 0].tolist(),
+            "high": geometry.joint_limits[:, 1].tolist(),
+        },
+        "target_margin": _quantity("rad", robot.joint_margin),
+    }
+
+
+def _high_table(pair: Pair, graph: HighGraph) -> Table:
+    config, physics, robot = pair.high_config, pair.low_config.physics, pair.low_config.robot
+    step = config.decimation * physics.control_dt
+    ranges = config.commands or pair.low_config.commands
+    probes = any(signal.name == "probes" for signal in graph.inputs)
+    trained_for = _trained_for(config, physics, {"noise_probes"} if probes else ())
+    if probes:
+        late = config.randomisation.scale * config.randomisation.probe_delay > 0.0
+        trained_for.append(_range("probe_delay", "s", "age of 'probes'", 0.0, step * late))
+    return _head("high", pair.high, graph, 1.0 / step) | {
+        "order": [{"graph": "high", "every": config.decimation}, {"graph": "low", "every": 1}],
+        "commands": _commands(ranges),
+        "trained_for": trained_for,
         "decision": (*CONTINUOUS, "gait"),
         "families": SEMANTIC,
         "probes": {
-            "ahead_left": _quantity("m", PROBES[task.probes].tolist()),
+            "ahead_left": _quantity("m", PROBES[config.probes].tolist()),
             "plane_below_trunk": _quantity("m", robot.base_height),
             "range": _quantity("m", PROBE_RANGE),
             "off_map": "nearest border",
         },
         "task": {
             "goal_radius": _quantity("m", GOAL_RADIUS),
-            "horizon": _quantity("s", round(task.episode_seconds / step) * step),
+            "horizon": _quantity("s", round(config.episode_seconds / step) * step),
             "family": {"scope": "whole tile", "otherwise": SEMANTIC[-1]},
             "after_goal": {
-                "keep_deciding": _quantity("s", round(task.hold_seconds / step) * step),
+                "keep_deciding": _quantity("s", round(config.hold_seconds / step) * step),
                 "then": "stand",
             },
             "after_horizon": "stand",
-            "stand": {"order": "commands", "value": default_command().tolist()},
+            "stand": {"order": "commands", "value": _stand(ranges).tolist()},
         },
     }
-    return {"low": low_table, "high": high_table}
 
 
 def _quantity(unit: str, value: Any) -> Table:
     return {"unit": unit, "value": value}
 
 
+def _range(name: str, unit: str, meaning: str, low: float, high: float) -> Table:
+    return {"name": name, "unit": unit, "meaning": meaning, "low": low, "high": high}
+
+
 def _head(name: str, policy: Policy, graph: LowGraph | HighGraph, rate: float) -> Table:
-    """Fields that both interface files begin with."""
+    """Fields that are the same in both interface files, or made in the same way."""
 
     def table(signal: Signal) -> Table:
         said = dataclasses.asdict(signal)
@@ -191,18 +259,47 @@ def _head(name: str, policy: Policy, graph: LowGraph | HighGraph, rate: float) -
         "rate": _quantity("Hz", rate),
         "inputs": [table(s) for s in graph.inputs],
         "outputs": [table(s) for s in graph.outputs],
+        "joints": JOINTS,
+        "gaits": [
+            {"name": gait, **dict(zip(NAMES[12:], row, strict=True))}
+            for gait, row in zip(GAITS, GAIT_TABLE.tolist(), strict=True)
+        ],
     }
 
 
 def _commands(ranges: CommandRanges) -> list[Table]:
-    """Name, unit and bounds of each command, in order; for the embedding, its two values."""
+    """Each command, in order, with its bounds or, if of the embedding, its two values."""
     bounds = CommandDecoder(ranges)
-    rows = zip(NAMES, UNITS, bounds.low.tolist(), bounds.high.tolist(), strict=True)
+    rows = zip(NAMES, UNITS, _MEANINGS, bounds.low.tolist(), bounds.high.tolist(), strict=True)
     return [
-        {"name": name, "unit": unit}
-        | ({"low": low, "high": high} if name in CONTINUOUS else {"values": [low, high]})
-        for name, unit, low, high in rows
+        _range(name, unit, meaning, low, high)
+        if name in CONTINUOUS
+        else {"name": name, "unit": unit, "meaning": meaning, "values": [low, high]}
+        for name, unit, meaning, low, high in rows
     ]
+
+
+def _trained_for(
+    config: LowLevelConfig | HighLevelConfig, physics: PhysicsConfig, noises: Collection[str | None]
+) -> list[Table]:
+    """Ranges of what differed from episode to episode, with those ``noises`` that inputs had."""
+    drawn, table = config.randomisation, []
+    nominal = {"friction": physics.friction, "motor_strength": 1.0}  # of all others 0
+    for name, (unit, meaning) in _DRAWN.items():
+        if name in noises or not name.startswith("noise_"):
+            value, middle = getattr(drawn, name), nominal.get(name, 0.0)
+            ends = value if isinstance(value, tuple) else (-value, value)
+            low, high = (middle + drawn.scale * (end - middle) for end in ends)
+            table.append(_range(name, unit, meaning, low, high))
+    return table
+
+
+def _stand(ranges: CommandRanges) -> Array:
+    """Commands to stay where one is: the default ones, with a posture within ``ranges``."""
+    command, (low, high) = default_command(), command_bounds(ranges).T
+    posture = slice(len(VELOCITIES), len(CONTINUOUS))
+    command[posture] = np.clip(command[posture], low[posture], high[posture])
+    return command
 
 
 def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
@@ -324,15 +421,9 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
         ValueError: the policies or the folder cannot be used.
     """
     pair, controller = load_pair(low, high), Controller(folder, form)
-    config, limit = pair.low_config, pair.low_config.robot.action_limit
     driver = HierarchyDriver(pair.high, pair.high_config)
-    decoder = CommandDecoder(driver.bounds, pair.high_config.action_limit, pair.high_config.gaits)
-    field = TileField((1, 1))
-    field.place(0, 0, make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
-    start, goal = field.starts[:, 0], field.goals[:, 0]
-    physics = dataclasses.replace(config.physics, control_dt=controller.dt)
-    world = World(1, controller.robot(), physics, field)
-    loco = Locomotion(1, config.robot, config.physics, field, config.gyro, world=world)
+    loco, start, goal = _stage(pair, controller)
+    world = loco.world
     differences: list[Array] = []
     seconds: list[float] = []
     log: list[tuple[bool, dict[str, Array]]] = []
@@ -346,29 +437,12 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
                 differences.append(world.state.q[0] - nominal_pose(world.robot))
                 driver.begin(loco, goal, _CHECKED_ON)
                 step = 0
-            readings = controller.sense(world.state, goal[0], _CHECKED_ON, field.height_at)
-            targets = controller.step(readings)
+            readings = controller.sense(world.state, goal[0], _CHECKED_ON, world.ground_height)
+            controller.step(readings)
             seconds.append(controller.seconds)
             log.append((ended, readings))
             driver.command(step)
-            assert driver.action is not None
-            decision = controller.high.values["decision"]
-            loco.command[:] = controller.commands
-            wanted = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
-            action = controller.low.values["action"]
-            error, speed = targets - world.state.q, world.state.qd
-            told, torque = (
-                pd_torque(error, speed, world.strength, robot)
-                for robot in (world.robot, config.robot)
-            )
-            loco.act(action[None])
-            differences += [
-                decision - driver.action[0],
-                controller.commands - decoder.decode(decision),
-                action - wanted[0],
-                targets - loco.targets[0, 0],
-                told[0] - torque[0],
-            ]
+            differences += _act(pair, controller, driver, loco)
             step += 1
             ended = bool(outcome(world, goal)[0] != GOING)
     finally:
@@ -381,6 +455,45 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
         repeated.append(controller.seconds)
     largest = np.abs(np.concatenate(differences)).max()
     return Check(float(largest), np.array(seconds), np.array(repeated))
+
+
+def _stage(pair: Pair, controller: Controller) -> tuple[Locomotion, Array, Array]:
+    """A robot as the controller's folder describes it, on a tile; its start (1, 3) and goal (1, 2).
+
+    What the simulator observes of it are the policies' own configurations.
+    """
+    config, field = pair.low_config, TileField((1, 1))
+    field.place(0, 0, make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
+    physics = dataclasses.replace(config.physics, control_dt=controller.dt)
+    world = World(1, controller.robot(), physics, field)
+    loco = Locomotion(1, config.robot, config.physics, field, config.gyro, world=world)
+    return loco, field.starts[:, 0], field.goals[:, 0]
+
+
+def _act(
+    pair: Pair, controller: Controller, driver: HierarchyDriver, loco: Locomotion
+) -> list[Array]:
+    """Carry out a step that controller and driver have decided on; how far policies and graphs
+    differ in it."""
+    limit, world = pair.low_config.robot.action_limit, loco.world
+    decoder = CommandDecoder(driver.bounds, pair.high_config.action_limit, pair.high_config.gaits)
+    decision, low = controller.high.values["decision"], controller.low.values
+    loco.command[:] = controller.commands
+    wanted = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
+    error, speed = low["joint_targets"] - world.state.q, world.state.qd
+    told, torque = (
+        pd_torque(error, speed, world.strength, robot)
+        for robot in (world.robot, pair.low_config.robot)
+    )
+    loco.act(low["action"][None])
+    assert driver.action is not None
+    return [
+        decision - driver.action[0],
+        controller.commands - decoder.decode(decision),
+        low["action"] - wanted[0],
+        low["joint_targets"] - loco.targets[0, 0],
+        told[0] - torque[0],
+    ]
 
 
 def _report(form: str, result: Check) -> bool:

@@ -13,13 +13,14 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from tdgc import diagnose, export
+from tdgc.config import RandomisationConfig, RobotConfig
 from tdgc.deploy import log
 from tdgc.deploy.controller import GRAPHS, Controller
 from tdgc.deploy.interface import SCHEMA, ExportError, read_interface
 from tdgc.deploy.log import LogError, LogWriter
 from tdgc.files import checksum
 from tdgc.sim.geometry import read_geometry
-from tdgc.sim.robot import RobotState
+from tdgc.sim.robot import RobotState, nominal_pose
 from tdgc.tasks.pairing import PRETRAINED
 
 FORM = "torchscript"  # takes a tenth of the time to write
@@ -103,7 +104,7 @@ def test_each_missing_field_is_refused_in_one_line(folder: Path, tmp_path: Path,
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 3}, "an interface of version 3, this package reads 4; export the policies"),
+        ({"version": 4}, "an interface of version 4, this package reads 5; export the policies"),
         ({"version": None}, "an interface of version None"),
         ({"rate": {"unit": "ms", "value": 50}}, "rate.unit: 'Hz' was expected"),
         ({"rate": {"unit": "Hz", "value": 0}}, "rate.value: 0 is less than or equal to"),
@@ -120,6 +121,53 @@ def test_other_interfaces_are_refused(
     with pytest.raises(ExportError) as refused:
         read_interface(tmp_path, "low")
     assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "value", "message"),
+    [
+        ("high", "commands 0 name", "speed", "commands[0].name: 'vx' was expected"),
+        ("low", "commands 4 unit", "1/s", "commands[4].unit: 'Hz' was expected"),
+        ("high", "decision 3", "height", "decision: ['vx', 'vy', "),
+        ("low", "gaits 1 phase", 0.5, "gaits[1]: {'name': 'pronk', 'phase': 0, 'offset': 0, "),
+        ("low", "gaits 1 name", "trot", "gaits[1]: {'name': 'pronk', 'phase': 0, 'offset': 0, "),
+        ("low", "start trunk_height value", np.nan, "trunk_height.value: nan is not of type 'num"),
+        ("high", "commands 1 low", -np.inf, "commands[1].low: -inf is not of type 'number'"),
+        ("high", "probes range value", 10**400, "probes.range.value: "),
+        ("low", "commands 2 low", 2.0, "yaw_rate: low, 2, is above high, 1"),
+        ("low", "trained_for 6 high", -1.0, "latency: low, 0, is above high, -1"),
+        ("low", "joint_control joint_limits high 5", -3.0, "FR_calf_joint: low, -2.82, is above "),
+        ("high", "families 5", None, "'family' has the size 6, its order 'families' has 5"),
+        ("high", "probes ahead_left value 0", None, "the size 32, its order 'probes' has 31"),
+        ("low", "outputs 0 shape 0", 11, "'last_action' has the size 12, its previous 'action' h"),
+        ("low", "inputs 2 order", "decision", "the size 12, its order 'decision' has 0"),
+        ("low", "inputs 7 previous", "next_phase", "'clock' has the size 1, its previous 'next_p"),
+        ("low", "inputs 8 start 0", None, "'last_commands' has the size 15, its start has 14"),
+        ("low", "inputs 6 source", "high.orders", "two exports: 'commands' has the shape [15], "),
+        ("high", "commands 0 high", 1.3, "of two exports: high's bounds of vx exceed low's; expo"),
+        ("high", "probes plane_below_trunk value", 0.28, "two exports: their standing heights d"),
+    ],
+)
+def test_fields_that_do_not_fit_are_refused_in_one_line(
+    folder: Path, tmp_path: Path, name: str, path: str, value: Any, message: str
+) -> None:
+    """The field at a path set to another value, or removed."""
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    file = tmp_path / f"{name}_interface.json"
+    inner = table = json.loads(file.read_text())
+    *above, last = (int(key) if key.isdigit() else key for key in path.split())
+    for key in above:
+        inner = inner[key]
+    if value is None:
+        del inner[last]
+    else:
+        inner[last] = value
+    file.write_text(json.dumps(table))
+    with pytest.raises(ExportError) as refused:
+        Controller(tmp_path, FORM)
+    said = str(refused.value)
+    assert message in said and "\n" not in said and len(said) < 400, said
 
 
 @pytest.mark.parametrize(
@@ -140,8 +188,12 @@ def test_another_robot_is_refused(
         controller.robot(urdf)
 
 
-def test_the_folder_brings_its_robot(folder: Path, controller: Controller) -> None:
+def test_the_folder_brings_its_robot(
+    folder: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(controller.low.table["robot"]["stance"], "width", 0.3)
     robot = controller.robot()
+    assert robot.stance == (0.38, 0.3)
     assert Path(robot.urdf).parent == folder
     assert sum(read_geometry(robot).masses.values()) == pytest.approx(12.6)
 
@@ -200,17 +252,6 @@ def test_a_reading_that_is_not_finite_is_refused_and_not_remembered(
             with pytest.raises(ExportError, match=rf"^'{name}' is not finite"):
                 controller.step(broken)
         np.testing.assert_array_equal(controller.step(readings), expected[step])
-
-
-def test_graphs_of_two_exports_are_refused(folder: Path, tmp_path: Path) -> None:
-    for path in folder.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    path = tmp_path / "high_interface.json"
-    table = json.loads(path.read_text())
-    table["probes"]["plane_below_trunk"]["value"] = 0.28
-    path.write_text(json.dumps(table))
-    with pytest.raises(ExportError, match=r"low and high in '.*' are of two exports"):
-        Controller(tmp_path, FORM)
 
 
 def test_it_stands_after_the_goal_and_after_the_horizon(controller: Controller) -> None:
@@ -429,6 +470,111 @@ def test_the_first_row_is_the_start_of_the_episode(
     assert log.read(changed(walk, tmp_path, time=time + 0.005), controller).time[0] == 0.005
     with pytest.raises(LogError, match=f"begins at {told} s, not at 0 s, where an episode starts"):
         log.read(changed(walk, tmp_path, time=time + start), controller)
+
+
+def test_rows_may_be_late_but_not_missing(
+    controller: Controller, walk: Path, tmp_path: Path
+) -> None:
+    time = np.load(walk)["time"]
+    for late in (0.01, 0.017):
+        for rows in (slice(5, 6), slice(5, None)):  # the next row catches up, or none does
+            stamps = time.copy()
+            stamps[rows] += late
+            found = log.read(changed(walk, tmp_path, time=stamps), controller)
+            assert np.array_equal(found.time, stamps)
+    for stamps, message in (
+        (np.append(time[:5], time[5:] + 0.02), "a gap at 0.08 s, where the next row is 0.040 s"),
+        (np.append(time[:5], time[4:-1]), "a gap at 0.08 s, where the next row is 0.000 s later"),
+        (np.append(time[:5], time[3:-2]), "a gap at 0.08 s, where the next row is -0.020 s later"),
+        (np.arange(12) / 34.0, "its rows are 0.0294 s apart (median), not 0.02 s: the graphs must"),
+        (np.arange(12) / 60.0, "its rows are 0.0167 s apart (median), not 0.02 s: the graphs must"),
+        (1000.0 * time, "its rows are 20 s apart (median), not 0.02 s: the graphs must run at 50"),
+    ):
+        with pytest.raises(LogError) as refused:
+            log.read(changed(walk, tmp_path, time=stamps), controller)
+        assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("single", [True, False])
+def test_single_entries_need_no_second_axis(
+    controller: Controller, walk: Path, tmp_path: Path, single: bool
+) -> None:
+    names = ("time", "yaw", "clock", "probe_age")
+    table = {name: np.load(walk)[name].reshape(12, *([] if single else [1])) for name in names}
+    found, wanted = (
+        log.read(path, controller) for path in (changed(walk, tmp_path, **table), walk)
+    )
+    assert np.array_equal(found.time, wanted.time)
+    for name in names[1:]:
+        assert np.array_equal(found.values[name], wanted.values[name], equal_nan=True)
+    with pytest.raises(LogError, match=r"'time' must be numbers \(12, 1\), not \(3, 4\)$"):
+        log.read(changed(walk, tmp_path, time=table["time"].reshape(3, 4)), controller)
+
+
+STANDING = nominal_pose(RobotConfig())
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"gravity": [0.0, 0.0, -9.81]}, "'gravity' at 0.00 s is 9.81 long; it must be a unit vec"),
+        ({"gravity": [0.0, 0.0, 1.0]}, "'gravity' is [0.0, 0.0, 1.0] in the first row; uprigh"),
+        ({"gravity": [0.0, -1.0, 0.0]}, "upright it must be about [0.0, 0.0, -1.0], frames.grav"),
+        ({"joint_angles": np.degrees(STANDING)}, "has 5.73 for FL_hip_joint, which turns from -0"),
+        ({"joint_angles": -STANDING}, "has 1.5 for FL_calf_joint, which turns from -2.82 to -0.89"),
+        ({"family": [0.0] * 6}, "is [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]; it must be 1 for one of rough"),
+        ({"family": [0.0, 0.5, 0.5, 0.0, 0.0, 0.0]}, "tilt, unknown and 0 for the others"),
+        ({"family": [0.0, 0.0, 2.0, 0.0, 0.0, 0.0]}, "'family' at 0.00 s is [0.0, 0.0, 2.0, "),
+    ],
+)
+def test_readings_in_another_unit_or_convention_are_refused(
+    controller: Controller, walk: Path, tmp_path: Path, values: dict[str, Any], message: str
+) -> None:
+    table = {name: np.tile(value, (12, 1)) for name, value in values.items()}
+    with pytest.raises(LogError) as refused:
+        log.read(changed(walk, tmp_path, **table), controller)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_log_of_noisy_sensors_and_a_fall_is_read(controller: Controller, tmp_path: Path) -> None:
+    """With training's noise, on unknown ground, and upside down at the end."""
+    config, rng = RandomisationConfig(), np.random.default_rng(0)
+    writer = LogWriter(controller)
+    controller.reset()
+    for step in range(101):
+        half = 0.5 * np.pi * max(0.0, 0.05 * step - 4.0)
+        rolled = [np.sin(half), 0.0, 0.0, np.cos(half)]
+        pose = state(controller, quaternion=rolled, q=STANDING)
+        readings = controller.sense(pose, np.array([5.0, 1.0]), "?", level)
+        for name, width in (
+            ("gravity", config.noise_gravity),
+            ("joint_angles", config.noise_joint_angle),
+            ("joint_speeds", config.noise_joint_speed),
+            ("gyro", config.noise_gyro),
+            ("probes", config.noise_probes),
+        ):
+            readings[name] = readings[name] + rng.uniform(-width, width, readings[name].shape)
+        if step == 100:
+            writer.end(readings)
+            break
+        controller.step(readings)
+        writer.add(readings)
+    writer.save(tmp_path / "noisy.npz")
+    found = log.read(tmp_path / "noisy.npz", controller)
+    assert found.values["gravity"][-1, 2] > 0.9 and len(found.decisions) == 20
+    assert log.trace(found, controller, "fell").family == "unknown"
+
+
+def test_a_timeout_lasts_to_the_horizon(
+    controller: Controller, walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = log.read(walk, controller)
+    with pytest.raises(LogError, match=r"^walk: ends at 0.22 s, before the horizon of 20 s$"):
+        log.outcome(found, controller, "timeout")
+    assert log.outcome(found, controller, "fell") == "fell"
+    monkeypatch.setattr(controller, "horizon", 11)
+    for told, ended in ((None, "timeout"), ("timeout", "timeout"), ("collided", "collided")):
+        assert log.outcome(found, controller, told) == ended
 
 
 def test_each_value_is_compared_with_the_graphs(

@@ -18,15 +18,15 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from tdgc import export, policies
-from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict
-from tdgc.deploy.controller import FORMATS, Graph
+from tdgc.config import HighLevelConfig, LowLevelConfig, RandomisationConfig, RobotConfig, to_dict
+from tdgc.deploy.controller import FORMATS, Controller, Graph
 from tdgc.deploy.graphs import HighGraph, LowGraph, by_command, foot_phases
 from tdgc.deploy.interface import ExportError
 from tdgc.export import TOLERANCE
 from tdgc.files import checksum
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
-from tdgc.sim.commands import CommandDecoder
+from tdgc.sim.commands import CommandDecoder, default_command
 from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import observe, width
@@ -496,8 +496,14 @@ def test_interface_says_how_to_drive_the_joints(folder: Path) -> None:
     assert table["robot"]["link_masses"]["value"]["trunk"] == 5.6
     assert table["feet"] == ["FL", "FR", "RL", "RR"]
     assert table["gaits"][0] == {"name": "trot", "phase": 0.5, "offset": 0.0, "bound": 0.0}
-    assert table["commands"][4] == {"name": "frequency", "unit": "Hz", "low": 2.0, "high": 4.0}
-    assert table["commands"][13] == {"name": "offset", "unit": "1", "values": [0.0, 0.5]}
+    assert table["robot"]["stance"] == {"unit": "m", "length": 0.38, "width": 0.25}
+    left = "velocity to the left, in the same frame"
+    assert table["commands"][1] == {"name": "vy", "unit": "m/s", "meaning": left,
+                                    "low": -0.6, "high": 0.6}  # fmt: skip
+    assert "; 0.25 is the robot's own stance" in table["commands"][9]["meaning"]
+    apart = "share of a cycle between front and rear pair: 0.5 in the gait bound"
+    assert table["commands"][13] == {"name": "offset", "unit": "1", "meaning": apart,
+                                     "values": [0.0, 0.5]}  # fmt: skip
 
 
 def test_interface_says_how_to_decide(folder: Path) -> None:
@@ -521,6 +527,52 @@ def test_interface_says_how_to_decide(folder: Path) -> None:
     said = {s["name"]: s["meaning"] for s in table["inputs"]}
     assert "of the whole tile, from start to goal" in said["family"]
     assert all("origin of the URDF's root link" in said[name] for name in ("goal", "probes"))
+
+
+def drawn(table: dict[str, Any]) -> dict[str, tuple[float, float, str]]:
+    return {entry["name"]: (entry["low"], entry["high"], entry["unit"])
+            for entry in table["trained_for"]}  # fmt: skip
+
+
+def test_interface_says_what_the_policies_were_trained_for(folder: Path, tmp_path: Path) -> None:
+    low, high = (
+        drawn(json.loads((folder / f"{name}_interface.json").read_text()))
+        for name in ("low", "high")
+    )
+    same = {"friction": (0.4, 1.25, "1"), "payload": (-1.0, 3.0, "kg"),
+            "motor_strength": (0.85, 1.1, "1"), "joint_offset": (-0.02, 0.02, "rad"),
+            "armature": (0.0, 0.015, "kg m^2"), "joint_friction": (0.0, 0.3, "N m"),
+            "latency": (0.0, 0.03, "s"), "push_speed": (-0.75, 0.75, "m/s")}  # fmt: skip
+    sensors = {"noise_gravity": (-0.02, 0.02, "1"), "noise_joint_angle": (-0.01, 0.01, "rad"),
+               "noise_joint_speed": (-0.3, 0.3, "rad/s"),
+               "noise_gyro": (-0.1, 0.1, "rad/s")}  # fmt: skip
+    assert low == same | sensors
+    # Only its probes have errors of their own in training.
+    assert high == same | {"noise_probes": (-0.02, 0.02, "m"), "probe_delay": (0.0, 0.1, "s")}
+    calm = dataclasses.replace(
+        HIGH_CONFIG, cues="none", randomisation=RandomisationConfig(scale=0.5)
+    )
+    pair = export.load_pair(LOW, random_high(tmp_path / "policy", calm, hidden=4))
+    export.write(pair, tmp_path, ["torchscript"])
+    half = drawn(json.loads((tmp_path / "high_interface.json").read_text()))
+    assert half.keys() == same.keys()
+    assert half["friction"] == (pytest.approx(0.6), pytest.approx(1.025), "1")
+    assert half["motor_strength"] == (pytest.approx(0.925), pytest.approx(1.05), "1")
+    assert half["push_speed"] == (-0.375, 0.375, "m/s")
+
+
+def test_a_pair_with_narrower_commands_can_be_exported(tmp_path: Path) -> None:
+    """As docs/deploy.md limits commands; it stands within the limits, and does not walk."""
+    narrow = dataclasses.replace(
+        HIGH_CONFIG.commands, vx=(0.2, 0.8), frequency=(3.5, 4.0), swing_height=(0.03, 0.05)
+    )
+    config = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0, commands=narrow)
+    high = random_high(tmp_path / "policy", config)
+    export.write(export.load_pair(LOW, high), tmp_path, ["torchscript"])
+    assert export.check(tmp_path, "torchscript", LOW, high).difference <= TOLERANCE
+    stand = Controller(tmp_path, "torchscript").high.table["task"]["stand"]["value"]
+    assert stand[:3] == [0.0, 0.0, 0.0] and stand[3:7] == [0.0, 3.5, 0.5, 0.05]
+    assert stand[7:] == default_command()[7:].tolist()
 
 
 def with_meshes(path: Path, names: Sequence[str]) -> LowLevelConfig:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from tdgc.config import CommandRanges, RobotConfig
-from tdgc.deploy.interface import ExportError, Table, read_interface
+from tdgc.deploy.interface import ExportError, Table, pair_misfits, read_interface
 from tdgc.files import checksum
 from tdgc.sim.commands import CONTINUOUS
 from tdgc.sim.geometry import read_geometry
@@ -222,13 +222,9 @@ class Controller:
         self._graphs = {name: Graph(folder, name, form) for name in GRAPHS}
         self.low, self.high = self._graphs["low"], self._graphs["high"]
         low, high = self.low.table, self.high.table
-        heights = low["robot"]["standing_height"], high["probes"]["plane_below_trunk"]
-        if heights[0] != heights[1] or any(
-            low[k] != high[k] for k in ("joints", "commands", "gaits")
-        ):
+        for misfit in pair_misfits(low, high):
             raise ExportError(
-                f"low and high in '{folder}' are of two exports: their joints, commands, gaits or "
-                "standing height differ; export the pair again"
+                f"low and high in '{folder}' are of two exports: {misfit}; export the pair again"
             )
         self._order = [(entry["graph"], entry["every"]) for entry in high["order"]]
         self._task, self._probes = high["task"], high["probes"]
@@ -364,6 +360,7 @@ class Controller:
             nominal_thigh=(thigh, pose[7]),
             nominal_calf=calf,
             base_height=table["robot"]["standing_height"]["value"],
+            stance=(table["robot"]["stance"]["length"], table["robot"]["stance"]["width"]),
             joint_margin=control["target_margin"]["value"],
         )
         for what, told, taken in (

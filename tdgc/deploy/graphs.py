@@ -342,6 +342,42 @@ class LowGraph(nn.Module):
         return (*step, cycles + run) if self.counted else step
 
 
+def _high_inputs(seconds: float) -> list[Signal]:
+    """Inputs that every high policy has, of episodes of ``seconds`` s."""
+    goal = (
+        "ahead of and to the left of the origin of the URDF's root link, in the frame that turns "
+        "by yaw alone"
+    )
+    clock = "the low policy's in its coming step"
+    start = tuple(default_command().tolist())
+    return [
+        Signal("goal", 2, "m", goal),
+        Signal("time_left", 1, "s", f"of {seconds:g} s"),
+        *_BODY,
+        Signal("last_decision", NUM_ACTIONS, "1", "the last", "decision", "decision", 0.0),
+        Signal("last_commands", NUM_COMMANDS, None, "the last", "commands", "commands", start),
+        Signal("clock", 1, "1", clock, start=0.0, source="low.next_clock"),
+    ]
+
+
+def _cues(config: HighLevelConfig, robot: RobotConfig) -> list[Signal]:
+    """Inputs that a high policy has only if it observes them."""
+    family = "1 for the terrain of the whole tile, from start to goal; 0 for the others"
+    probes = (
+        "ground at points of the frame that turns by yaw alone, above a plane "
+        f"{robot.base_height:g} m under the origin of the URDF's root link; clipped at "
+        f"{PROBE_RANGE:g} m"
+    )
+    before = "the goal at the last decision; 0 at the first"
+    cues = {
+        "family": Signal("family", len(SEMANTIC), "1", family, "families"),
+        "probes": Signal("probes", NUM_PROBES, "m", probes, "probes"),
+        "probe_age": Signal("probe_age", 1, "s", "since the probes were measured"),
+        "closing_speed": Signal("last_goal", 2, "m", before, None, "goal", 0.0),
+    }
+    return [cues[term.name] for term in high_layout(config) if term.name in cues]
+
+
 class HighGraph(nn.Module):
     """One decision of the high policy (Sec. IV-B): goal, cues and sensors to the 15 commands.
 
@@ -353,9 +389,7 @@ class HighGraph(nn.Module):
         super().__init__()
         self.actor = ClippedActor(policy)
         self.remember = policy.remember
-        layout = high_layout(config)
-        self.row = Row(layout)
-        hidden = policy.state_size
+        self.row = Row(high_layout(config))
         decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
         self.low = _constant(decoder.low[:12])
         self.span = _constant(decoder.high[:12] - decoder.low[:12])
@@ -366,56 +400,17 @@ class HighGraph(nn.Module):
         seconds = round(config.episode_seconds / step) * step
         self.seconds, self.step = _constant(seconds), _constant(step)
         self.ahead = _constant([1.0, 0.0])
-        start = tuple(default_command().tolist())
-        family = "1 for the terrain of the whole tile, from start to goal; 0 for the others"
-        probes = (
-            "ground at points of the frame that turns by yaw alone, above a plane "
-            f"{low.robot.base_height:g} m under the origin of the URDF's root link; clipped at "
-            f"{PROBE_RANGE:g} m"
-        )
-        cues = {
-            "family": Signal("family", len(SEMANTIC), "1", family, "families"),
-            "probes": Signal("probes", NUM_PROBES, "m", probes, "probes"),
-            "probe_age": Signal("probe_age", 1, "s", "since the probes were measured"),
-            "closing_speed": Signal(
-                "last_goal",
-                2,
-                "m",
-                "the goal at the last decision; 0 at the first",
-                None,
-                "goal",
-                0.0,
-            ),
-        }
+        state = {"hidden": "state of the LSTM", "cell": "cell of the LSTM"}
+        size = policy.state_size
         self.inputs = [
-            Signal(
-                "goal",
-                2,
-                "m",
-                "ahead of and to the left of the origin of the URDF's root link, in the frame that "
-                "turns by yaw alone",
-            ),
-            Signal("time_left", 1, "s", f"of {seconds:g} s"),
-            *_BODY,
-            Signal("last_decision", NUM_ACTIONS, "1", "the last", "decision", "decision", 0.0),
-            Signal("last_commands", NUM_COMMANDS, None, "the last", "commands", "commands", start),
-            Signal(
-                "clock",
-                1,
-                "1",
-                "the low policy's in its coming step",
-                start=0.0,
-                source="low.next_clock",
-            ),
-            *(cues[term.name] for term in layout if term.name in cues),
-            Signal("hidden", hidden, "1", "state of the LSTM", None, "next_hidden", 0.0),
-            Signal("cell", hidden, "1", "cell of the LSTM", None, "next_cell", 0.0),
+            *_high_inputs(seconds),
+            *_cues(config, low.robot),
+            *(Signal(k, size, "1", what, None, f"next_{k}", 0.0) for k, what in state.items()),
         ]
         self.outputs = [
             Signal("decision", NUM_ACTIONS, "1", "raw actions", "decision"),
             Signal("commands", NUM_COMMANDS, None, "for the low policy", "commands"),
-            Signal("next_hidden", hidden, "1", "state of the LSTM"),
-            Signal("next_cell", hidden, "1", "cell of the LSTM"),
+            *(Signal(f"next_{k}", size, "1", what) for k, what in state.items()),
         ]
 
     def forward(self, *values: Tensor) -> tuple[Tensor, ...]:

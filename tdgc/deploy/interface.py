@@ -5,7 +5,9 @@
 
 import functools
 import json
+import sys
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from tdgc.config import read_json
 from tdgc.errors import InputError
 
 #: Version of the interface files; any change to their contents gets a new one.
-VERSION = 4
+VERSION = 5
 SCHEMA = Path(__file__).with_name("interface.schema.json")
 
 Table = dict[str, Any]
@@ -32,7 +34,8 @@ def read_interface(folder: Path, name: str) -> Table:
     """Read the interface file of the graph ``name`` in an exported folder.
 
     Raises:
-        ExportError: the file has another version, or lacks a field or has an invalid one.
+        ExportError: the file has another version, lacks a field or has an invalid one, or has two
+            that do not fit each other.
         ConfigError: the file cannot be read or is not JSON.
     """
     from jsonschema.exceptions import best_match
@@ -50,12 +53,61 @@ def read_interface(folder: Path, name: str) -> Table:
         where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in error.absolute_path)
         said = textwrap.shorten(error.message, 200, placeholder="...")
         raise ExportError(f"{path}: {where.removeprefix('.') or 'the interface'}: {said}")
+    for misfit in _misfits(table):
+        raise ExportError(f"{path}: {misfit}")
     return dict(table)
 
 
 @functools.cache
 def _validator(name: str) -> Any:
-    from jsonschema import Draft202012Validator
+    """Validator of the graph ``name``'s interface file; NaN and Infinity are no numbers to it."""
+    from jsonschema import Draft202012Validator, validators
 
+    known, largest = Draft202012Validator.TYPE_CHECKER, sys.float_info.max
+    finite = known.redefine(
+        "number", lambda _, value: known.is_type(value, "number") and abs(value) <= largest
+    )
     definitions = json.loads(SCHEMA.read_text(encoding="utf-8"))["$defs"]
-    return Draft202012Validator({"$defs": definitions, "$ref": f"#/$defs/{name}"})
+    schema = {"$defs": definitions, "$ref": f"#/$defs/{name}"}
+    return validators.extend(Draft202012Validator, type_checker=finite)(schema)
+
+
+def _misfits(table: Table) -> Iterator[str]:
+    """Describe fields that do not fit each other, in a table that the schema admits."""
+    ranges = [*table["commands"], *table["trained_for"]]
+    if "joint_control" in table:
+        limits = table["joint_control"]["joint_limits"]
+        ends = zip(table["joints"], limits["low"], limits["high"], strict=True)
+        ranges += [{"name": joint, "low": low, "high": high} for joint, low, high in ends]
+    for entry in ranges:
+        if "low" in entry and entry["low"] > entry["high"]:
+            yield f"{entry['name']}: low, {entry['low']:g}, is above high, {entry['high']:g}"
+    named = dict(table)  # what names the entries of a signal, by the signal's 'order'
+    if "probes" in table:
+        named["probes"] = table["probes"]["ahead_left"]["value"]
+    signals = table["inputs"] + table["outputs"]
+    sizes = {signal["name"]: signal["shape"][0] for signal in signals}
+    for signal in signals:
+        name, order, previous, start = (signal[k] for k in ("name", "order", "previous", "start"))
+        others = {"start": len(start)} if isinstance(start, list) else {}
+        if order is not None:
+            others[f"order '{order}'"] = len(named.get(order, ()))
+        if previous is not None:
+            others[f"previous '{previous}'"] = sizes.get(previous, 0)
+        for what, size in others.items():
+            if size != sizes[name]:
+                yield f"'{name}' has the size {sizes[name]}, its {what} has {size}"
+
+
+def pair_misfits(low: Table, high: Table) -> Iterator[str]:
+    """Describe what in the interfaces of two graphs shows that they are not of one export."""
+    if low["robot"]["standing_height"] != high["probes"]["plane_below_trunk"]:
+        yield "their standing heights differ"
+    for mine, trained in zip(high["commands"], low["commands"], strict=True):
+        if "low" in mine and (mine["low"] < trained["low"] or mine["high"] > trained["high"]):
+            yield f"high's bounds of {mine['name']} exceed low's"
+    made = {f"{t['graph']}.{s['name']}": s["shape"] for t in (low, high) for s in t["outputs"]}
+    for signal in low["inputs"] + high["inputs"]:
+        source = signal["source"]
+        if source is not None and made.get(source) != signal["shape"]:
+            yield f"'{signal['name']}' has the shape {signal['shape']}, {source} {made.get(source)}"

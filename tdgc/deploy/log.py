@@ -42,6 +42,14 @@ DECIDED = ("family", "probes", "probe_age", "decision")
 OPTIONAL = {"gyro": 3, "yaw": 1}
 ENDS = ("reached", "fell", "collided", "timeout")  # of an episode without a tile
 _SAME = 5e-3  # in the value's own unit: logs with four decimals differ by up to 3e-3, in leaps
+# Share of a step: at 50 Hz the millisecond to which a program may round its time stamps.
+_PUNCTUAL = 0.05
+# Off the length of gravity: training's errors, 0.02 in each entry, reach 0.035; those of Walk These
+# Ways, 0.05, reach 0.087.
+_LENGTH = 0.1
+# rad beyond a joint's limits: simulated joints and the errors of their sensors reach 0.04; the calf
+# of a standing robot is 2.4 beyond with the wrong sign, and 83 in degrees.
+_BEYOND = 1.0
 
 
 class LogError(InputError):
@@ -120,7 +128,8 @@ def read(path: Path, controller: Controller) -> Log:
 
     Raises:
         LogError: the file is missing or damaged, lacks values or rows, has values that are not
-            numbers, does not begin at 0 s, or has decisions where none are due.
+            numbers, does not begin at 0 s, is of a loop at another rate, has decisions where none
+            are due, or has readings in another unit or convention than the interface's.
     """
     known = {"time", *layout(controller)}
     try:
@@ -133,8 +142,7 @@ def read(path: Path, controller: Controller) -> Log:
     left_out = [name for name in OPTIONAL if name not in table and name not in taken]
     sizes = {name: size for name, size in layout(controller).items() if name not in left_out}
     rows = table["time"].size if "time" in table else 0
-    shapes: dict[str, tuple[int, ...]] = {"time": (rows,)}
-    shapes |= {name: (rows, size) for name, size in sizes.items()}
+    shapes = {name: (rows, size) for name, size in ({"time": 1} | sizes).items()}
     for name, shape in shapes.items():
         if name not in table:
             raise LogError(f"{path}: lacks '{name}'; it needs {', '.join(shapes)}")
@@ -142,17 +150,17 @@ def read(path: Path, controller: Controller) -> Log:
             raise LogError(f"{path}: '{name}' must be numbers {shape}, not {table[name].shape}")
     values = {name: table[name].astype(np.float64) for name in sizes}
     decisions = np.flatnonzero(np.isfinite(values["decision"]).all(axis=1))
-    log = Log(path.stem, table["time"].astype(np.float64), values, decisions)
-    gap = _gap(log, controller)
-    if gap is not None:
-        raise LogError(f"{path}: {gap}")
+    log = Log(path.stem, table["time"][:, 0].astype(np.float64), values, decisions)
+    wrong = _mistimed(log.time, controller.dt) or _gap(log, controller) or _misread(log, controller)
+    if wrong is not None:
+        raise LogError(f"{path}: {wrong}")
     return log
 
 
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Read values by name."""
+    """Read values by name; those with a single entry may be of shape (rows,)."""
     with np.load(path) as file:
-        return dict(file)
+        return {name: x[:, None] if x.ndim == 1 else x for name, x in file.items()}
 
 
 def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
@@ -184,22 +192,36 @@ def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
         if missing:
             raise LogError(f"{path}: no column '{name}_{min(missing)}', but '{name}_{max(mine)}'")
         table[name] = cells[:, [mine[k] for k in range(len(mine))]]
-    return table | {"time": table["time"][:, 0]} if "time" in table else table
+    return table
 
 
-def _gap(log: Log, controller: Controller) -> str | None:
-    """Describe a gap in a log; None if there is none."""
-    time, dt = log.time, controller.dt
+def _mistimed(time: Array, dt: float) -> str | None:
+    """Describe what is wrong with the time stamps of rows ``dt`` s apart; None if nothing is.
+
+    A row that is late by less than a step is not: the program was slow there, but left no row out.
+    """
     if len(time) < 2 or not np.isfinite(time).all():
         return "needs two rows at least, each with its time"
     if abs(time[0]) > 0.5 * dt:
         return f"begins at {time[0]:.2f} s, not at 0 s, where an episode starts"
-    for k in np.flatnonzero(np.abs(np.diff(time) - dt) > 0.5 * dt):
-        step = time[k + 1] - time[k]
+    later = np.diff(time)
+    usual = np.median(later)
+    if abs(usual - dt) > _PUNCTUAL * dt:
         return (
-            f"a gap at {time[k]:.2f} s, where the next row is {step:.3f} s later and not {dt:g} s"
+            f"its rows are {usual:.3g} s apart (median), not {dt:g} s: the graphs must run at "
+            f"{1.0 / dt:g} Hz"
         )
-    steps = np.arange(len(time))
+    for k in np.flatnonzero((later <= 0.0) | (later > (2.0 - _PUNCTUAL) * dt)):
+        return (
+            f"a gap at {time[k]:.2f} s, where the next row is {later[k]:.3f} s later and not "
+            f"{dt:g} s"
+        )
+    return None
+
+
+def _gap(log: Log, controller: Controller) -> str | None:
+    """Describe a value or decision that is missing, or a decision too many; None if none is."""
+    time, dt, steps = log.time, controller.dt, np.arange(len(log.time))
     for names, rows in (
         ((*SENSED, *OPTIONAL), steps),
         (GIVEN, steps[:-1]),
@@ -220,6 +242,36 @@ def _gap(log: Log, controller: Controller) -> str | None:
             f"{task['after_goal']['keep_deciding']['value']:g} s after the goal is reached, for "
             f"{task['horizon']['value']:g} s at most"
         )
+    return None
+
+
+def _misread(log: Log, controller: Controller) -> str | None:
+    """Describe a reading in another unit or convention than the interface's; None if none is."""
+    low, high, time = controller.low.table, controller.high.table, log.time
+    gravity, level = log.values["gravity"], low["frames"]["gravity_when_level"]["value"]
+    lengths = np.linalg.norm(gravity, axis=1)
+    for k in np.flatnonzero(np.abs(lengths - 1.0) > _LENGTH):
+        return f"'gravity' at {time[k]:.2f} s is {lengths[k]:.3g} long; it must be a unit vector"
+    if gravity[0] @ level < np.sqrt(0.5):  # steeper than 45 degrees, no robot stands at its start
+        return (
+            f"'gravity' is {gravity[0].round(2).tolist()} in the first row; upright it must be "
+            f"about {level}, frames.gravity_when_level"
+        )
+    angles, limits = log.values["joint_angles"], low["joint_control"]["joint_limits"]
+    ends = np.array([limits["low"], limits["high"]])
+    for k, j in np.argwhere((angles < ends[0] - _BEYOND) | (angles > ends[1] + _BEYOND)):
+        return (
+            f"'joint_angles' at {time[k]:.2f} s has {angles[k, j]:.3g} for {low['joints'][j]}, "
+            f"which turns from {ends[0, j]:g} to {ends[1, j]:g} rad; it must be in rad, along "
+            "joint_control.axes"
+        )
+    for k in log.decisions if "family" in log.values else ():
+        told, families = log.values["family"][k], high["families"]
+        if np.abs(told - np.eye(len(families))[told.argmax()]).max() > _SAME:
+            return (
+                f"'family' at {time[k]:.2f} s is {told.tolist()}; it must be 1 for one of "
+                f"{', '.join(families)} and 0 for the others"
+            )
     return None
 
 
@@ -269,7 +321,8 @@ def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
 
     Raises:
         LogError: the log does not show how the episode ended and ``told`` is None, or ``told`` is
-            "reached" but the log never reaches the goal.
+            "reached" but the log never reaches the goal, or "timeout" but it ends before the
+            horizon.
     """
     goals, task = log.values["goal"], controller.high.table["task"]
     distance = np.linalg.norm(goals, axis=1)
@@ -277,10 +330,15 @@ def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
         return "reached"
     if told == "reached":
         raise LogError(f"{log.name}: comes no nearer to the goal than {distance.min():.2f} m")
+    if controller.over(len(log.time) - 1, None):
+        return told or "timeout"
+    if told == "timeout":
+        raise LogError(
+            f"{log.name}: ends at {log.time[-1]:.2f} s, before the horizon of "
+            f"{task['horizon']['value']:g} s"
+        )
     if told is not None:
         return told
-    if log.time[-1] > task["horizon"]["value"] - 0.5 * controller.dt:
-        return "timeout"
     raise LogError(
         f"{log.name}: ends at {log.time[-1]:.2f} s, {distance[-1]:.2f} m from the goal; say how "
         f"with --outcome {' or '.join(ENDS[1:3])}"
@@ -309,59 +367,26 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
         c.name: np.full(len(rows), np.nan if c.unit else None, np.float32 if c.unit else object)
         for c in COLUMNS
     }
-
-    def fill(where: slice, found: dict[str, Any]) -> None:
-        for name, values in found.items():
-            columns[name][where] = values
-
-    pitch, roll = tilt(seen["gravity"])
-    ahead, left = seen["goal"][rows].T
-    fill(
-        slice(None),
-        {
-            "time": log.time[rows],
-            "pitch": pitch[rows],
-            "roll": roll[rows],
-            "goal_distance": np.hypot(ahead, left),
-            "goal_bearing": np.arctan2(left, ahead),
-        },
-    )
-    command = seen["commands"][begin]
-    fill(slice(-1), action_columns(seen["decision"][begin]))
-    # A gait may start faster than requested, so the frequency carried out is the clock's advance in
-    # the first step of the decision. It is unknown (NaN) if that step was the last of the log.
-    carried_out = command.copy()
-    went = np.append(np.mod(np.diff(seen["clock"][:-1, 0]), 1.0), [np.nan] * 2)
-    carried_out[:, INDEX["frequency"]] = went[begin] / controller.dt
-    fill(slice(-1), command_columns(command, carried_out, controller.bounds))
-    told_families = ["unknown"]
+    families, places = np.array(["unknown"], object), ""
+    decided = _decided(log, controller)
     if "family" in seen:
-        families = controller.high.table["families"]
-        told_families = [families[i] for i in seen["family"][begin].argmax(axis=1)]
-        fill(slice(-1), {"family": told_families})
-    places = ""
+        families = np.array(controller.high.table["families"], object)
+        families = families[seen["family"][begin].argmax(axis=1)]
+        decided["family"] = families
     if "probes" in seen:
         places = probe_places(controller.high.table["probes"]["ahead_left"]["value"])
-        fill(slice(-1), probe_columns(seen["probes"][begin]))
-    seconds = log.time[end] - log.time[begin]
-    errors = {
-        f"error_{name}": [values[a + 1 : b + 1].mean() for a, b in zip(begin, end, strict=True)]
-        - command[:, INDEX[name]]
-        for name, values in (("pitch", pitch), ("roll", roll))
-    }
-    yaw = _heading(log)
-    if yaw is not None:
-        turned = yaw[end] - yaw[begin]
-        goal = seen["goal"][:, 0] + 1j * seen["goal"][:, 1]  # ahead + i left
-        # How the goal moved relative to the robot, in the heading halfway through the turn.
-        way = goal[begin] * np.exp(-0.5j * turned) - goal[end] * np.exp(0.5j * turned)
-        for name, change in (("vx", way.real), ("vy", way.imag), ("yaw_rate", turned)):
-            errors[f"error_{name}"] = change / seconds - command[:, INDEX[name]]
-    fill(slice(1, None), {"seconds": seconds} | errors)
+        decided |= probe_columns(seen["probes"][begin])
+    for where, found in (
+        (slice(None), _state(log, rows)),
+        (slice(-1), decided),
+        (slice(1, None), _execution(log, begin, end)),
+    ):
+        for name, values in found.items():
+            columns[name][where] = values
     return Trace(
         "tdgc",
         file_label(log.name),
-        "+".join(dict.fromkeys(told_families)),
+        "+".join(dict.fromkeys(families)),
         NO_TILE,
         0,
         NO_TILE,
@@ -369,6 +394,50 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
         columns,
         places,
     )
+
+
+def _state(log: Log, rows: NDArray[np.intp]) -> dict[str, Array]:
+    """Columns of the state in these ``rows`` (n,), (n,) each."""
+    pitch, roll = tilt(log.values["gravity"][rows])
+    ahead, left = log.values["goal"][rows].T
+    return {
+        "time": log.time[rows],
+        "pitch": pitch,
+        "roll": roll,
+        "goal_distance": np.hypot(ahead, left),
+        "goal_bearing": np.arctan2(left, ahead),
+    }
+
+
+def _decided(log: Log, controller: Controller) -> dict[str, NDArray[Any]]:
+    """Columns of the actions and commands of each decision."""
+    seen, begin = log.values, log.decisions
+    command = seen["commands"][begin]
+    # A gait may start faster than requested, so the frequency carried out is the clock's advance in
+    # the first step of the decision. It is unknown (NaN) if that step was the last of the log.
+    carried_out = command.copy()
+    went = np.append(np.mod(np.diff(seen["clock"][:-1, 0]), 1.0), [np.nan] * 2)
+    carried_out[:, INDEX["frequency"]] = went[begin] / controller.dt
+    columns = command_columns(command, carried_out, controller.bounds)
+    return action_columns(seen["decision"][begin]) | columns
+
+
+def _execution(log: Log, begin: NDArray[np.intp], end: NDArray[np.intp]) -> dict[str, Array]:
+    """Columns of how decisions were carried out, each from its row ``begin`` to its row ``end``."""
+    seen, command = log.values, log.values["commands"][begin]
+    columns = {"seconds": log.time[end] - log.time[begin]}
+    for name, values in zip(("pitch", "roll"), tilt(seen["gravity"]), strict=True):
+        mean = np.array([values[a + 1 : b + 1].mean() for a, b in zip(begin, end, strict=True)])
+        columns[f"error_{name}"] = mean - command[:, INDEX[name]]
+    yaw = _heading(log)
+    if yaw is not None:
+        turned = yaw[end] - yaw[begin]
+        goal = seen["goal"][:, 0] + 1j * seen["goal"][:, 1]  # ahead + i left
+        # How the goal moved relative to the robot, in the heading halfway through the turn.
+        way = goal[begin] * np.exp(-0.5j * turned) - goal[end] * np.exp(0.5j * turned)
+        for name, change in (("vx", way.real), ("vy", way.imag), ("yaw_rate", turned)):
+            columns[f"error_{name}"] = change / columns["seconds"] - command[:, INDEX[name]]
+    return columns
 
 
 def _heading(log: Log) -> Array | None:
