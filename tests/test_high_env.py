@@ -22,7 +22,7 @@ from tdgc.config import (
 )
 from tdgc.sim.commands import NAMES, CommandDecoder, default_command, gait_index
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.observation import JOINTS, columns, width
+from tdgc.sim.observation import JOINT_FLIP, columns, width
 from tdgc.sim.robot import nominal_pose
 from tdgc.sim.terrain import TILE_SIZE, make_tile
 from tdgc.tasks import high_env, high_rewards
@@ -173,7 +173,7 @@ def test_mirrored_robots_see_mirrored_things(cues):
     xy = origin + [[x - 0.7, y + 0.1], [x - 0.7, TILE_SIZE - y - 0.1]]
     loco.place(np.arange(2), xy, np.array([0.3, -0.3]), np.full(2, 0.2))
     angles = rng.normal(0.0, 0.2, 12)
-    index, flip = JOINTS
+    index, flip = JOINT_FLIP
     state.q[:] = [NOMINAL + angles, NOMINAL + angles[list(index)] * flip]
     state.derive()
     task.rewards.actions[0] = rng.uniform(-1.0, 1.0, 13)

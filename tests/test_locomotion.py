@@ -12,7 +12,7 @@ from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, Robo
 from tdgc.sim.commands import INDEX, observed_command
 from tdgc.sim.gaits import GAITS, foot_phases, gait_embedding
 from tdgc.sim.locomotion import GYRO_SCALE, SPEED_SCALE, Locomotion, actor_layout
-from tdgc.sim.observation import JOINTS, Flip, columns, width
+from tdgc.sim.observation import JOINT_FLIP, Flip, columns, width
 from tdgc.sim.robot import Array, nominal_pose, target_limits, walking_pose
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TILE_SIZE, Tile, make_tile
@@ -334,8 +334,8 @@ ALL = Flip(MIRROR.obs_index, MIRROR.obs_sign)
 
 
 def test_mirroring_twice_is_nothing() -> None:
-    assert Flip(MIRROR.action_index, MIRROR.action_sign) == JOINTS
-    for flip, size in ((ALL, 130), (JOINTS, 12)):
+    assert Flip(MIRROR.action_index, MIRROR.action_sign) == JOINT_FLIP
+    for flip, size in ((ALL, 130), (JOINT_FLIP, 12)):
         x = np.random.default_rng(0).normal(size=(3, size))
         assert mirrored(x, flip).shape == x.shape
         assert (mirrored(mirrored(x, flip), flip) == x).all()
@@ -344,10 +344,10 @@ def test_mirroring_twice_is_nothing() -> None:
 
 def test_action_mirror_swaps_legs_and_flips_hips() -> None:
     x = np.arange(1.0, 13.0)
-    assert mirrored(x, JOINTS).tolist() == [
+    assert mirrored(x, JOINT_FLIP).tolist() == [
         -4.0, 5.0, 6.0, -1.0, 2.0, 3.0, -10.0, 11.0, 12.0, -7.0, 8.0, 9.0
     ]  # fmt: skip
-    np.testing.assert_allclose(mirrored(NOMINAL, JOINTS), NOMINAL, atol=0)
+    np.testing.assert_allclose(mirrored(NOMINAL, JOINT_FLIP), NOMINAL, atol=0)
 
 
 def mirror_commands(loco: Locomotion, rng: np.random.Generator, gait: int) -> None:
@@ -380,12 +380,12 @@ def test_a_mirrored_robot_sees_a_mirrored_world(gait: int) -> None:
     xy = np.array([[0.3, 0.4], [0.3, -0.4]])
     loco.place(np.arange(2), xy, np.array([yaw, -yaw]), loco.clock.clock.copy())
     offset = rng.uniform(-0.02, 0.02, 12)
-    loco.joint_offset[:] = [offset, mirrored(offset, JOINTS)]
+    loco.joint_offset[:] = [offset, mirrored(offset, JOINT_FLIP)]
     loco.world.push([0, 1], np.array([[0.2, 0.3, 0.0], [0.2, -0.3, 0.0]]))
     rewards = []
     for _ in range(40):
         action = rng.normal(0.0, 1.0, 12)
-        reward, _, _ = task.step(np.stack([action, mirrored(action, JOINTS)]))
+        reward, _, _ = task.step(np.stack([action, mirrored(action, JOINT_FLIP)]))
         rewards.append(reward)
         first, second = task.observe()
         np.testing.assert_allclose(second, mirrored(first, ALL), atol=5e-6)
@@ -431,13 +431,13 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
     loco.place(np.arange(2), xy, np.array([0.4, -0.4]), loco.clock.clock.copy())
     for _ in range(20):
         loco.act(np.tile(rng.normal(0.0, 0.5, 12), (2, 1)))
-        loco.actions[:, 1] = mirrored(loco.actions[:, 0], JOINTS)
+        loco.actions[:, 1] = mirrored(loco.actions[:, 0], JOINT_FLIP)
         state.position[1] = state.position[0] * [1, -1, 1] + [pitch, 2 * middle, 0.0]
         state.quaternion[1] = state.quaternion[0] * [-1, 1, -1, 1]
         state.lin_vel[1] = state.lin_vel[0] * [1, -1, 1]
         state.ang_vel[1] = state.ang_vel[0] * [-1, 1, -1]
         for joints in (state.q, state.qd):
-            joints[1] = mirrored(joints[0], JOINTS)
+            joints[1] = mirrored(joints[0], JOINT_FLIP)
         state.foot_force[1] = state.foot_force[0, [1, 0, 3, 2]]
         state.derive()
         task.ground = measure_ground(task.locomotion)

@@ -3,13 +3,13 @@
 import numpy as np
 
 from tdgc.config import RandomisationConfig
-from tdgc.sim.observation import LEGS, Flip, Term, columns, in_place, mirror, observe, width
+from tdgc.sim.observation import LEG_FLIP, Flip, Term, columns, in_place, mirror, observe, width
 from tdgc.sim.sensors import Noise
 
 LAYOUT: tuple[Term[np.ndarray], ...] = (
     Term("speed", 2, lambda x: x[:, :2], 10.0, "noise_gyro", in_place(1.0, -1.0)),
     Term("mean", 1, lambda x: x.mean(axis=1, keepdims=True)),
-    Term("contact", 4, lambda x: np.tile(x[:, :1] > 0.0, 4), mirror=LEGS),
+    Term("contact", 4, lambda x: np.tile(x[:, :1] > 0.0, 4), mirror=LEG_FLIP),
 )
 SOURCE = np.array([[1.0, 2.0, 3.0], [-1.0, 0.0, 4.0]])
 

@@ -47,8 +47,9 @@ class RobotConfig:
     # drags its swing feet: with zero actions, feet commanded to 8 cm in trot do not leave the
     # ground.
     commanded_gait: bool = field(default=True, metadata={"before": False})
-    # Gait cycles after a start or a change of gait over which q0's swing grows to its commanded
-    # height: of 21 falls while walking with random changes of gait, 19 came within 0.7 s of one.
+    # Gait cycles after a start or a change of gait over which q0's swing height and stride grow to
+    # the commanded ones: of 21 falls while walking with random changes of gait, 19 came within
+    # 0.7 s of one.
     swing_ramp: NotNegative = 1.0
     # Hz and gait cycles: a gait starts at no less than ``start_frequency`` and slows down to the
     # commanded frequency over ``start_cycles``. Falls in 10 minutes with a random gait every 2 s:
@@ -135,7 +136,7 @@ class RandomisationConfig:
     armature: Range = field(default=(0.0, 0.015), metadata={"before": (0.0, 0.0)})
     # N m, dry friction of each joint; the same models have 0.2.
     joint_friction: Range = field(default=(0.0, 0.3), metadata={"before": (0.0, 0.0)})
-    latency: Range = (0.0, 0.03)  # s between decision and effect (real robots: about 30 ms)
+    latency: Range = (0.0, 0.03)  # s from joint targets to effect (real robots: about 30 ms)
     push_speed: NotNegative = 0.75  # m/s, largest horizontal push (benchmark's `pushes`)
     push_interval: PositiveRange = (3.0, 8.0)  # s between pushes
     noise_gravity: NotNegative = 0.02  # 1, half-width of uniform noise, as in all ``noise_*``

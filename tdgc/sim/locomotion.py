@@ -16,7 +16,15 @@ from tdgc.config import ConfigError, PhysicsConfig, RandomisationConfig, Range, 
 from tdgc.sim.commands import INDEX, NAMES, SIDEWAYS, default_command, gait_index, observed_command
 from tdgc.sim.gaits import GAITS, PhaseClock, foot_phases
 from tdgc.sim.geometry import Geometry
-from tdgc.sim.observation import ARROW, JOINTS, LEGS, TURN, Term, in_place, observe
+from tdgc.sim.observation import (
+    JOINT_FLIP,
+    LEG_FLIP,
+    RATE_FLIP,
+    VECTOR_FLIP,
+    Term,
+    in_place,
+    observe,
+)
 from tdgc.sim.robot import (
     NUM_JOINTS,
     Array,
@@ -328,18 +336,18 @@ def _pose(loco: Locomotion) -> Array:
 _FLIP_COMMAND = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in NAMES))
 # fmt: off
 _ACTOR_LAYOUT: tuple[Term[Locomotion], ...] = (
-    Term("gravity", 3, lambda loco: loco.world.state.gravity, 1.0, "noise_gravity", ARROW),
-    Term("joint_error", 12, _joint_error, 1.0, "noise_joint_angle", JOINTS),
-    Term("pose", 12, _pose, mirror=JOINTS),
+    Term("gravity", 3, lambda loco: loco.world.state.gravity, 1.0, "noise_gravity", VECTOR_FLIP),
+    Term("joint_error", 12, _joint_error, 1.0, "noise_joint_angle", JOINT_FLIP),
+    Term("pose", 12, _pose, mirror=JOINT_FLIP),
     Term("joint_speed", 12, lambda loco: loco.world.state.qd, SPEED_SCALE, "noise_joint_speed",
-         JOINTS),
-    Term("last_action", 12, lambda loco: loco.actions[0], mirror=JOINTS),
-    Term("action_before", 12, lambda loco: loco.actions[1], mirror=JOINTS),
+         JOINT_FLIP),
+    Term("last_action", 12, lambda loco: loco.actions[0], mirror=JOINT_FLIP),
+    Term("action_before", 12, lambda loco: loco.actions[1], mirror=JOINT_FLIP),
     Term("command", 15, _command, mirror=_FLIP_COMMAND),
-    Term("clock", 4, lambda loco: loco.clock.signal(), mirror=LEGS),
-    Term("clock_cosine", 4, lambda loco: loco.clock.cosine(), mirror=LEGS),
+    Term("clock", 4, lambda loco: loco.clock.signal(), mirror=LEG_FLIP),
+    Term("clock_cosine", 4, lambda loco: loco.clock.cosine(), mirror=LEG_FLIP),
     Term("gait", 1, _gait),
-    Term("gyro", 3, lambda loco: loco.world.state.body_rate, GYRO_SCALE, "noise_gyro", TURN),
+    Term("gyro", 3, lambda loco: loco.world.state.body_rate, GYRO_SCALE, "noise_gyro", RATE_FLIP),
 )
 # fmt: on
 

@@ -30,9 +30,11 @@ def in_place(*sign: float) -> Flip:
 
 #: Flips of (forward, left, up) vectors, of rotations about these axes, and of vectors with one
 #: entry per leg or joint.
-ARROW, TURN = in_place(1.0, -1.0, 1.0), in_place(-1.0, 1.0, -1.0)
-LEGS = Flip((1, 0, 3, 2), (1.0,) * 4)
-JOINTS = Flip(tuple(3 * leg + j for leg in LEGS.source for j in range(3)), (-1.0, 1.0, 1.0) * 4)
+VECTOR_FLIP, RATE_FLIP = in_place(1.0, -1.0, 1.0), in_place(-1.0, 1.0, -1.0)
+LEG_FLIP = Flip((1, 0, 3, 2), (1.0,) * 4)
+JOINT_FLIP = Flip(
+    tuple(3 * leg + j for leg in LEG_FLIP.source for j in range(3)), (-1.0, 1.0, 1.0) * 4
+)
 
 
 @dataclass(frozen=True)

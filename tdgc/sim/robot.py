@@ -351,7 +351,8 @@ class RobotState:
         geometry: the robots' geometry.
         position, quaternion: trunk in the world, (M, 3) m and (M, 4).
         lin_vel, ang_vel: trunk in the world, (M, 3) m/s and rad/s.
-        q, qd, torque: joints, (M, 12) rad, rad/s and N m (torque of the last physics step).
+        q, qd, torque: joints, (M, 12) rad, rad/s and N m (torque of the last physics step; in
+            Bullet less the dry friction, which MuJoCo applies by itself).
         foot_force: normal contact force on each foot in the last physics step, (M, 4) N.
         leg_force: the same on each leg above the foot (hip, thigh and calf), (M, 4) N.
         trunk_force: largest normal force on the trunk in the control step, (M,) N; in Bullet read

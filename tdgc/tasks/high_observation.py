@@ -12,9 +12,9 @@ from tdgc.policies import Mirror
 from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS
 from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
 from tdgc.sim.observation import (
-    ARROW,
-    JOINTS,
-    LEGS,
+    JOINT_FLIP,
+    LEG_FLIP,
+    VECTOR_FLIP,
     Flip,
     Term,
     columns,
@@ -87,12 +87,12 @@ _PROBES = Flip(PROBE_SWAP, (1.0,) * NUM_PROBES)
 _TERMS: tuple[Term[HighSources], ...] = (
     Term("goal", 3, _goal, mirror=in_place(1.0, 1.0, -1.0)),
     Term("time_left", 1, lambda s: 1.0 - s.time_share[:, None]),
-    Term("gravity", 3, lambda s: s.loco.world.state.gravity, mirror=ARROW),
-    Term("joint_error", 12, _joint_error, mirror=JOINTS),
-    Term("joint_speed", 12, lambda s: s.loco.world.state.qd, SPEED_SCALE, mirror=JOINTS),
+    Term("gravity", 3, lambda s: s.loco.world.state.gravity, mirror=VECTOR_FLIP),
+    Term("joint_error", 12, _joint_error, mirror=JOINT_FLIP),
+    Term("joint_speed", 12, lambda s: s.loco.world.state.qd, SPEED_SCALE, mirror=JOINT_FLIP),
     Term("last_action", 13, lambda s: s.last_action, mirror=_FLIP_ACTION),
-    Term("clock", 4, lambda s: s.loco.clock.signal(), mirror=LEGS),
-    Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), mirror=LEGS),
+    Term("clock", 4, lambda s: s.loco.clock.signal(), mirror=LEG_FLIP),
+    Term("clock_cosine", 4, lambda s: s.loco.clock.cosine(), mirror=LEG_FLIP),
     Term("family", len(SEMANTIC), lambda s: np.eye(len(SEMANTIC))[s.families]),
     Term("probes", NUM_PROBES, lambda s: s.probes, 1.0 / PROBE_RANGE, mirror=_PROBES),
     Term("probe_age", 1, lambda s: s.late[:, None].astype(np.float64)),

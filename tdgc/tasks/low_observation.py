@@ -7,7 +7,16 @@ import numpy as np
 
 from tdgc.config import LowLevelConfig
 from tdgc.sim.locomotion import GYRO_SCALE, Locomotion, actor_layout
-from tdgc.sim.observation import ARROW, JOINTS, LEGS, TURN, Flip, Term, mirror, width
+from tdgc.sim.observation import (
+    JOINT_FLIP,
+    LEG_FLIP,
+    RATE_FLIP,
+    VECTOR_FLIP,
+    Flip,
+    Term,
+    mirror,
+    width,
+)
 from tdgc.sim.robot import NUM_JOINTS, Array
 from tdgc.tasks.ground import GROUND_PROBES, Ground
 
@@ -42,12 +51,14 @@ _PROBE_SWAP = tuple(3 * (i // 3) + 2 - i % 3 for i in range(len(GROUND_PROBES)))
 _PROBES = Flip(_PROBE_SWAP, (1.0,) * len(GROUND_PROBES))
 #: The critic's own part of the observation, which the actor never sees.
 CRITIC_LAYOUT: tuple[Term[CriticSources], ...] = (
-    Term("velocity", 3, lambda s: s.loco.world.state.heading_vel, 2.0, mirror=ARROW),
-    Term("angular_velocity", 3, lambda s: s.loco.world.state.body_rate, GYRO_SCALE, mirror=TURN),
+    Term("velocity", 3, lambda s: s.loco.world.state.heading_vel, 2.0, mirror=VECTOR_FLIP),
+    Term(
+        "angular_velocity", 3, lambda s: s.loco.world.state.body_rate, GYRO_SCALE, mirror=RATE_FLIP
+    ),
     Term("base_height", 1, lambda s: (s.ground.base - s.loco.robot.base_height)[:, None], 10.0),
-    Term("foot_height", 4, lambda s: s.ground.feet, 10.0, mirror=LEGS),
-    Term("foot_contact", 4, lambda s: s.loco.world.state.touching, mirror=LEGS),
-    Term("desired_contact", 4, lambda s: s.loco.clock.contact, mirror=LEGS),
+    Term("foot_height", 4, lambda s: s.ground.feet, 10.0, mirror=LEG_FLIP),
+    Term("foot_contact", 4, lambda s: s.loco.world.state.touching, mirror=LEG_FLIP),
+    Term("desired_contact", 4, lambda s: s.loco.clock.contact, mirror=LEG_FLIP),
     Term("dynamics", 6, _dynamics),
     Term("terrain", 15, lambda s: np.clip(s.ground.probes, -0.5, 0.5), 5.0, mirror=_PROBES),
 )
@@ -65,4 +76,4 @@ def low_mirror(config: LowLevelConfig) -> "Mirror":
     """Left-right mirror of the low policy's observations and actions."""
     from tdgc.policies import Mirror  # here, so that the low policy's workers need no PyTorch
 
-    return Mirror(*mirror((*actor_layout(config.robot, config.gyro), *CRITIC_LAYOUT)), *JOINTS)
+    return Mirror(*mirror((*actor_layout(config.robot, config.gyro), *CRITIC_LAYOUT)), *JOINT_FLIP)

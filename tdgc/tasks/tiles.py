@@ -58,8 +58,8 @@ def check_levels(levels: int) -> None:
 
 
 def shallow(tile: Tile, level: int, shallowest: float) -> Tile:
-    """The tile with shallower trenches: their depth grows with the square of the level, from
-    ``shallowest`` m on level 0 to the full 60 cm on level 10.
+    """The tile with shallower trenches and pits: their greatest depth grows with the square of the
+    level, from ``shallowest`` m on level 0 to the full 60 cm on level 10.
 
     At full depth even the narrowest trench traps a leg for good, and a robot that falls at the
     first trench whatever it does learns nothing. A depth linear in the level grows too fast: trot
