@@ -67,7 +67,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--policies",
         help="comma-separated: tdgc (the hierarchy), gp (the scripted baseline), cues (a script "
         "that sees what tdgc sees), teacher (the teacher of train_high.py, which knows the heights "
-        "of the tile); all means tdgc,gp (all; gp if there is no high policy)",
+        "of the tile); all means tdgc,gp (all)",
     )
     who.add_argument(
         "--low", type=Path, default=PRETRAINED / "low", help="low policy (the shipped one)"
@@ -372,7 +372,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     painters = e.workers if e.cluster is None else usable_cores()
     problems = film.produce(recordings, out / "films", painters) if recordings else []
     try:
-        print(f"all of it on one page: {report.write(out)}")
+        print(f"report: {report.write(out)}")
     except OSError as error:
         problems.append(f"no {report.NAME}: {error}")
     return problems

@@ -3,7 +3,7 @@
 
 python train_high.py                       complete training, on runs/low/policy or the shipped one
 python train_high.py --low runs/low/policy
-python train_high.py --init tdgc/pretrained/high --set env.commands.vx=[-1,0.8]
+python train_high.py --init runs/high/policy --set env.commands.vx=[-1,0.8] --out runs/slow
 python train_high.py --resume --out runs/high
 """
 
@@ -296,8 +296,8 @@ def check(config: HighTrainConfig, control_dt: float) -> None:
     check_rules(env.window, env.threshold, env.levels)
     if env.first_level + env.first_levels > env.levels:
         raise ConfigError(
-            f"'env.first_level' and 'env.first_levels' must leave robots on the {env.levels} "
-            f"levels, not on {env.first_levels} from {env.first_level} up"
+            f"'env.first_level' and 'env.first_levels' must add up to at most {env.levels} levels, "
+            f"not {env.first_level + env.first_levels}"
         )
     first = HighLevelConfig.first_level, HighLevelConfig.first_levels
     if config.imitation.steps and (env.first_level, env.first_levels) != first:
@@ -340,7 +340,7 @@ def main(arguments: list[str] | None = None) -> int:
     recipe = high.add_mutually_exclusive_group()
     recipe.add_argument(
         "--preset", choices=PRESETS, default="default",
-        help="hyperparameters: default, or paper for the paper's (default)",
+        help="hyperparameters: default or the paper's (default)",
     )  # fmt: skip
     recipe.add_argument(
         "--no-teacher", action="store_true", help="reinforcement learning alone, without imitation"

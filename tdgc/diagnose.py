@@ -25,7 +25,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("log", type=Path, help="the log, .npz or .csv (docs/deploy.md)")
     parser.add_argument("--export", type=Path, required=True, help="exported folder on the robot")
     parser.add_argument(
-        "--outcome", choices=log.ENDS, help="how the episode ended; only fell and collided need it"
+        "--outcome",
+        choices=log.ENDS,
+        help="how the episode ended; required only for fell and collided",
     )
     parser.add_argument(
         "--out", type=Path, default=Path("runs/diagnosis"), help="results folder (runs/diagnosis)"
@@ -59,13 +61,13 @@ def main(arguments: list[str] | None = None) -> int:
     ]
     if differ:
         print(
-            f"tdgc.diagnose: not what the graphs give: {'; '.join(differ)}: a value was not passed "
+            f"tdgc.diagnose: differs from the graphs: {'; '.join(differ)}: a value was not passed "
             "on or not logged as it was, or these are not the graphs that ran",
             file=sys.stderr,
         )
         return 1
     largest = max(off for off, _ in compared.values())
-    print(f"{', '.join(compared)} are what the graphs give, to {largest:.1e}")
+    print(f"{', '.join(compared)} match the graphs within {largest:.1e}")
     return 0
 
 

@@ -503,8 +503,8 @@ def _report(form: str, result: Check) -> bool:
     )
     print(
         f"{form}: largest difference {result.difference:.1e} in {len(result.seconds)} control "
-        f"steps; a step takes {median:.3f} ms (median; 99 % at most {slow:.3f} ms) between the "
-        f"simulator's, {again:.3f} ms ({slow_again:.3f} ms) right after the one before"
+        f"steps; a step takes {median:.3f} ms (median; 99 % at most {slow:.3f} ms) interleaved "
+        f"with the simulator's, {again:.3f} ms ({slow_again:.3f} ms) back to back"
     )
     good = result.difference <= TOLERANCE
     if not good:

@@ -612,7 +612,7 @@ def test_what_differs_from_the_graphs_is_named(
     assert diagnose.main([str(path), *flags]) == 1
     said = capsys.readouterr().err
     off = np.abs(np.load(walk)["commands"][:-1] - 0.123).max()
-    assert f"not what the graphs give: commands from 0.00 s on, by up to {off:.3f}: " in said
+    assert f"differs from the graphs: commands from 0.00 s on, by up to {off:.3f}: " in said
     assert "joint_targets" not in said and said.count("\n") == 1
 
 
@@ -627,7 +627,7 @@ def test_a_reached_goal_leaves_no_older_diagnosis(
     assert diagnose.main([str(arrival[0]), *flags]) == 0
     said = capsys.readouterr().out
     assert "arrival: reached after " in said
-    assert "decision, clock, commands, joint_targets are what the graphs give, to " in said
+    assert "decision, clock, commands, joint_targets match the graphs within " in said
     assert not (tmp_path / "diagnosis.csv").exists()
 
 

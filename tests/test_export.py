@@ -656,7 +656,7 @@ def test_command_writes_checks_and_reports(
     assert said.err == "" and said.out.count("\n") == 1
     assert said.out.startswith("torchscript: largest difference ")
     assert " in 50 control steps; a step takes " in said.out
-    assert " right after the one before" in said.out
+    assert " back to back" in said.out
     monkeypatch.setattr(export, "TOLERANCE", -1.0)
     assert export.main(arguments) == 1
     said = capsys.readouterr()

@@ -733,7 +733,7 @@ def test_flags_and_folders_that_cannot_be_used(
         ("env.window=8", "threshold must be above (window + 1) / 2 and at most window, not 3 with"),
         (
             "env.first_levels=20",
-            "'env.first_level' and 'env.first_levels' must leave robots on the",
+            "'env.first_level' and 'env.first_levels' must add up to at most 11 levels, not 20",
         ),
         ("env.levels=0", "'env.levels' must be at least 1, not 0"),
         ("env.levels=13", "'env.levels' must be from 1 to 11, not 13"),

@@ -77,12 +77,12 @@ _NOISE = RandomisationConfig(probe_delay=1.0)
 CONDITIONS: dict[str, Condition] = {
     "nominal": Condition("nothing", episodes_share=1.0),
     "levels-11-12": Condition("levels 11, 12", levels=(11, 12)),
-    "mixed": Condition("terrain mixed, which nothing was trained on", families=("mixed",)),
+    "mixed": Condition("tiles of two families, never trained on", families=("mixed",)),
     "friction-0.4": Condition("friction 0.4", friction=0.4),
     "payload-3kg": Condition("3 kg on the trunk", payload=3.0),
     "pushes": Condition(f"pushes of 0.75 m/s every {PUSH_INTERVAL:g} s", push_speed=0.75),
     "motor-0.85": Condition("0.85 times the torque limits and gains of the joints", motor=0.85),
-    "armature-0.01": Condition("rotors of 0.01 kg m^2 in the joints", armature=0.01),
+    "armature-0.01": Condition("rotor inertia of 0.01 kg m^2 per joint", armature=0.01),
     "latency-30ms": Condition("commands reach the joints 30 ms late", latency=0.03),
     "physics-1000hz": Condition("physics at 1000 Hz", physics_hz=1000),
     "noise": Condition(

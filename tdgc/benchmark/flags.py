@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
         const=1,
         default=0,
         metavar="N",
-        help="films, sheets and strips of the first N episodes of each cell (none; 1 without N)",
+        help="film the first N episodes of each cell (off; N is 1 if omitted)",
     )
     groups.machine.add_argument(
         "--workers",
