@@ -120,7 +120,13 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
             other settings.
         WorkerError: a worker failed.
     """
-    learned = policies.load(out / "policy")
+    try:
+        learned = policies.load(out / "policy")
+    except policies.PolicyFileError:
+        if not (out / "uncalibrated.json").exists():
+            raise
+        # Killed while the calibrated copy was being written.
+        learned = policies.load(out / "uncalibrated")
     robots, done = config.calibration.robots, learned.meta.pop("calibration", None)
     if done is not None and (done["robots"] or not robots):
         asked = {"robots": robots, "turns": config.calibration.turns}
@@ -128,7 +134,8 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
             if done[name] != asked[name]:
                 raise ConfigError(
                     f"{out / 'policy'} is already calibrated, with 'calibration.{name}' "
-                    f"{done[name]}, not {asked[name]}; python -m tdgc.calibration does it again"
+                    f"{done[name]}, not {asked[name]}; python -m tdgc.calibration --low "
+                    f"{out / 'uncalibrated'} does it again"
                 )
         return
     if not robots:

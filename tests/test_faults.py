@@ -54,6 +54,19 @@ def fragile() -> Iterator[TaskVecEnv]:
 # ------------------------------------------------------------------ workers
 
 
+def test_episodes_that_end_with_the_last_fault_are_over(fragile: TaskVecEnv) -> None:
+    """The checkpoint after it begins new ones; a robot that blows up ends those of its worker."""
+    fragile.reset()
+    step(fragile, actions())
+    for _ in range(2):
+        step(fragile, actions(r3=RAISE))
+    with pytest.raises(WorkerError):
+        step(fragile, actions(r1=NAN_SEEN, r3=RAISE))
+    assert fragile.starts().tolist()[:2] == [True, True]
+    first, _ = fragile.state_dicts()
+    assert first["lengths"].tolist() == [0, 0] and first["returns"].tolist() == [0.0, 0.0]
+
+
 def test_workers_that_die_or_raise_are_started_anew(fragile: TaskVecEnv) -> None:
     """Worker 1 dies, then raises; worker 0 continues undisturbed."""
     fragile.reset()

@@ -606,6 +606,10 @@ def test_calibration_ends_a_run_of_the_low_policy(
     assert weights(broken) == (whole / "uncalibrated.safetensors").read_bytes()
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
     assert weights(broken) == weights(whole)
+    # Killed when of the calibrated copy only the weights were written.
+    shutil.copy(whole / "uncalibrated.json", broken / "policy.json")
+    assert train_low.main(["--resume", "--out", str(broken)]) == 0
+    assert weights(broken) == weights(whole)
 
     # A run that was to end without it can be calibrated later.
     later = tmp_path / "later"
@@ -649,7 +653,7 @@ def test_faults_of_a_run(
         assert train_low.main(arguments) == 0
     output = capsys.readouterr().out
     assert "no checkpoint at 16 steps, the one before stays: [Errno 27] File too large" in output
-    assert "no log row at 32 steps: [Errno 27] File too large" in output
+    assert "no complete log row at 32 steps: [Errno 27] File too large" in output
     seed = worker_seed(3, 0, 1)
     assert f"worker 0 died (exit code -9); restarted with seed {seed} (restart 1)" in output
     assert f"stopped by the test; continue with --resume --out {tmp_path}" in output
@@ -668,6 +672,7 @@ def test_faults_of_a_run(
         "train_low.py: 3 faults of workers within 1000 steps; the last one: worker 0 died "
         "(exit code -9)"
     )
+    assert [len(row["faults"]) for row in rows(tmp_path)][-1] > 0
     last = Checkpoint.read(newest(tmp_path))
     assert last.steps == 96 and last.header["workers"][0]["restarts"] == 3
     assert all(tensor.isfinite().all() for tensor in last.tensors.values())
@@ -680,6 +685,7 @@ def test_flags_and_folders_that_cannot_be_used(
     used, empty = tmp_path / "used", tmp_path / "empty"
     used.mkdir()
     (used / "config.json").write_text(json.dumps(to_dict(LowTrainConfig())), encoding="utf-8")
+    (used / "log.jsonl").write_text("", encoding="utf-8")
     damaged = tmp_path / "damaged"
     shutil.copytree(used, damaged)
     (damaged / "config.json").write_text('{"seed": ', encoding="utf-8")

@@ -17,7 +17,7 @@ from stubs import Counter, make_counter, make_failing
 
 from tdgc.config import LowLevelConfig, PhysicsConfig
 from tdgc.parallel.vec import TaskVecEnv, worker_seed
-from tdgc.parallel.worker import WorkerError
+from tdgc.parallel.worker import ProcessLink, WorkerError
 from tdgc.state import split
 from tdgc.tasks.low_env import LowLevelTask
 
@@ -233,6 +233,21 @@ def test_a_terminals_interrupt_is_the_parents_to_answer(counters: TaskVecEnv) ->
         os.kill(pid, signal.SIGTERM)
     assert counters.reset().shape == (5, 3)
     assert set(counters.worker_pids) <= {p.pid for p in multiprocessing.active_children()}
+
+
+class InterruptedLink(ProcessLink):
+    """A worker that gets a terminal's signals while it still imports its modules."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        os.kill(self.pid, signal.SIGINT)
+        os.kill(self.pid, signal.SIGTERM)
+
+
+def test_signals_to_workers_that_start_are_the_parents_to_answer() -> None:
+    env = TaskVecEnv(make_counter, 2, 1, seed=3, spaces=SPACES, link=InterruptedLink)
+    assert env.reset().shape == (2, 3)
+    env.close()
 
 
 @pytest.mark.parametrize("workers", [0, 4, -1])

@@ -10,6 +10,7 @@ import json
 import os
 import random
 import shutil
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,12 +142,13 @@ class Checkpoint:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
-            shutil.rmtree(final, ignore_errors=True)
+            if final.exists():  # of the same step; out of the way in an instant
+                os.replace(final, folder / f".{final.name}-before.partial")
             os.replace(partial, final)
         except OSError:
             shutil.rmtree(partial, ignore_errors=True)  # it may be what filled the disk
             raise
-        for old in sorted(folder.glob("step-*"))[:-_KEEP]:
+        for old in (*sorted(folder.glob("step-*"))[:-_KEEP], *folder.glob(".step-*.partial")):
             shutil.rmtree(old)
         return final
 
@@ -173,9 +175,9 @@ class Checkpoint:
             if notebook is not None:
                 notebook.restore(tensors, cast(Any, model).n_steps)
         except (RuntimeError, KeyError, ValueError) as error:
-            line = str(error).splitlines()[0]
+            said = textwrap.shorten(str(error), 200, placeholder="...")
             raise CheckpointError(
-                f"the checkpoint does not fit the configuration: {line}"
+                f"the checkpoint does not fit the configuration: {said}"
             ) from error
         if _LSTM[0] in tensors:
             h_pi, c_pi, h_vf, c_vf = (tensors[name].to(model.device) for name in _LSTM)

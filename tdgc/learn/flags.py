@@ -91,7 +91,7 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
                 f"{error}; a run of another version cannot be resumed: start one in another "
                 f"folder, with --init {args.out / 'policy'} to begin from its policy"
             ) from error
-    elif stored.exists():
+    elif stored.exists() and _has_begun(args.out):
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
     given: list[str] = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
@@ -104,7 +104,14 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
         config = with_overrides(config, [f"workers={workers}"])
     if args.cluster is not None:
         check_workers(config.workers, cores)
+    if config.workers > config.n_envs:
+        raise ConfigError(f"workers must be 1 to the {config.n_envs} robots, not {config.workers}")
     return config
+
+
+def _has_begun(run: Path) -> bool:
+    """Whether there is anything to lose in a run folder: a checkpoint, or a row of the log."""
+    return (run / "log.jsonl").exists() or any((run / "checkpoints").glob("step-*"))
 
 
 def check_device(name: str) -> None:

@@ -173,6 +173,8 @@ class Run:
                 finished = learn(model, callback, phase.until)
             except WorkerError:
                 callback.tell_faults()
+                callback.num_timesteps = model.num_timesteps
+                callback.log()
                 callback.save()
                 raise
             # A phase's policy is kept beside those of later phases.
@@ -285,9 +287,9 @@ class RunCallback(BaseCallback):
         policies.save(self.run.folder / name, policy, {**self.run.meta, **progress})
 
     def log(self) -> None:
-        """Write a log row about the steps since the last row, if there are any."""
+        """Write a log row about the steps and faults since the last row, if there are any."""
         steps, seconds = self._logged_at
-        if steps == self.num_timesteps:
+        if steps == self.num_timesteps and not self._faults:
             return
         sums: dict[str, float] = {}
         for part in self.env.stats():
@@ -316,16 +318,17 @@ class RunCallback(BaseCallback):
         row |= {k: _short(v) for k, v in values.items()} | {"faults": self._faults}
         try:
             append_line(self.run.folder / "log.jsonl", json.dumps(row))
+            self._faults = []
             if self._tensorboard_failed:  # its writer cannot recover from an error
                 folder = self.run.folder / "tensorboard"
                 self.model.set_logger(tensorboard_logger(folder, steps))
             for key, value in values.items():
                 self.logger.record(key, value)
             self.logger.dump(self.num_timesteps)
-            self._faults, self._tensorboard_failed = [], False
+            self._tensorboard_failed = False
         except OSError as error:
             self._tensorboard_failed = True
-            tqdm.write(f"no log row at {self.num_timesteps} steps: {error}")
+            tqdm.write(f"no complete log row at {self.num_timesteps} steps: {error}")
         self._logged_at = (self.num_timesteps, self.seconds)
 
     def _on_training_end(self) -> None:

@@ -10,8 +10,8 @@ from tdgc.parallel.worker import (
     WorkerError,
     end_with_parent,
     keep_memory,
-    leave_signals_to_parent,
     one_blas_thread,
+    signals_left_to_parent,
 )
 
 Job = TypeVar("Job")
@@ -29,7 +29,9 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
     spawn = mp.get_context("spawn")
     with one_blas_thread(), ProcessPoolExecutor(processes, spawn, _begin) as pool:
         try:
-            yield from pool.map(work, jobs)
+            with signals_left_to_parent():
+                results = pool.map(work, jobs)  # starts the processes
+            yield from results
         except BrokenProcessPool:
             raise WorkerError("a process died, perhaps out of memory") from None
         except BaseException:  # the jobs under way are no longer needed
@@ -42,7 +44,6 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
 def _begin() -> None:
     keep_memory()
     end_with_parent()
-    leave_signals_to_parent()
 
 
 class RunJobs(Protocol):

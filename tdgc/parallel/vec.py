@@ -243,7 +243,12 @@ class TaskVecEnv(VecEnv):
         views = self._views
         if self._broken:
             seen = views["obs"].copy()
-            lost = self._mend()
+            try:
+                lost = self._mend()
+            except WorkerError:  # a checkpoint follows: the other robots' new episodes begin
+                over = (views["terminated"] | views["truncated"]).astype(bool)
+                self._returns[over], self._lengths[over] = 0.0, 0
+                raise
             views["last_obs"][lost] = seen[lost]
             views["rewards"][lost] = 0.0
             views["terminated"][lost], views["truncated"][lost] = False, True

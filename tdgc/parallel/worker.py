@@ -20,6 +20,7 @@ import threading
 import traceback
 import types
 from collections.abc import Callable, Iterator
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
@@ -217,7 +218,7 @@ class Worker:
         elif word == "load":
             try:
                 _load(self.task, self._views, argument)
-            except ValueError as error:  # of another configuration
+            except (ValueError, KeyError, TypeError) as error:  # of another configuration
                 answer = str(error)
         elif word == "state":
             answer = {**self.task.state_dict(), "obs": self._views["obs"].copy()}
@@ -255,15 +256,8 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def leave_signals_to_parent() -> None:
-    """Ignore the signals that a terminal or a batch system sends to all processes."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-
-
 def _serve(pipe: Connection, arrays: Arrays, beginning: Beginning) -> None:
     """Run a worker: send its state, then answer one request at a time until ``close``."""
-    leave_signals_to_parent()
     end_with_parent()
     worker: Worker | None = None
     try:
@@ -282,6 +276,23 @@ def _serve(pipe: Connection, arrays: Arrays, beginning: Beginning) -> None:
     finally:
         if worker is not None:
             worker.task.close()
+
+
+@contextlib.contextmanager
+def signals_left_to_parent() -> Iterator[None]:
+    """Block, in processes started in this context, the signals that a terminal or a batch system
+    sends to all processes.
+
+    They inherit it, so it holds while they still import their modules. Signals to this process are
+    handled at the end of the context.
+    """
+    resource_tracker.ensure_running()  # with the first process it would unblock the signals
+    blocked = signal.SIGINT, signal.SIGTERM
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, blocked)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 #: Variables that set the number of threads of a linear algebra call, whichever library makes it.
@@ -356,7 +367,7 @@ class ProcessLink:
             daemon=True,
             name=f"tdgc-worker-{worker}",
         )
-        with one_blas_thread(), _without_script(beginning.make_task):
+        with one_blas_thread(), signals_left_to_parent(), _without_script(beginning.make_task):
             self._process.start()
         theirs.close()
 
