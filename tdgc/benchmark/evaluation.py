@@ -391,7 +391,7 @@ def closed_loop(
     log: EpisodeLog,
     watchers: Sequence[Watcher] = (),
 ) -> None:
-    """Run the paper's closed loop (Sec. III) until every episode of a batch has ended."""
+    """Run the paper's closed loop (Sec. IV) until every episode of a batch has ended."""
     for step in itertools.count():
         live = log.live
         if not live.size:

@@ -174,70 +174,82 @@ class Header:
             PolicyFileError: not JSON, another format or version, an unknown or missing key, or a
                 value of the wrong type or out of range. The message does not name the file.
         """
-        try:
-            table = json.loads(text, parse_constant=_no_constant)
-        except (ValueError, RecursionError) as error:
-            raise PolicyFileError(f"not JSON ({_one_line(error)})") from None
-        if not isinstance(table, dict) or table.get("format") != FORMAT:
-            raise PolicyFileError(f"not a {FORMAT} file")
-        version = table.get("version")
-        if not isinstance(version, int) or isinstance(version, bool) or version != VERSION:
-            raise PolicyFileError(f"format version {_shown(version)}; this code reads {VERSION}")
-        keys = ("format", "version", "kind", "architecture", "observation", "action", "mirror",
-                "sha256", "meta")  # fmt: skip
-        _check_keys(table, keys, "the file")
-        kind, sha256, meta = table["kind"], table["sha256"], table["meta"]
-        if kind not in KINDS:
-            raise PolicyFileError(f"kind {_shown(kind)}; known: {', '.join(KINDS)}")
-        if not isinstance(sha256, str):
-            raise PolicyFileError(f"'sha256' must be a string, not {_shown(sha256)}")
-        if not isinstance(meta, dict):
-            raise PolicyFileError(f"'meta' must be a table, not {_shown(meta)}")
-
-        arch = table["architecture"]
-        if isinstance(arch, dict):
-            arch = {"encoder": []} | arch  # older files have no encoder
-        _check_keys(arch, ("activation", "actor", "critic", "lstm", "encoder"), "'architecture'")
-        if not isinstance(arch["activation"], str) or arch["activation"] not in ACTIVATIONS:
-            known = ", ".join(ACTIVATIONS)
-            raise PolicyFileError(f"activation {_shown(arch['activation'])}; known: {known}")
-        if (arch["lstm"] is not None) != (kind == "lstm"):
-            raise PolicyFileError(f"'lstm' is {_shown(arch['lstm'])} in a file of kind '{kind}'")
-        encoder = _sizes(arch["encoder"], "'encoder'")
-        if encoder and kind != "lstm":
-            raise PolicyFileError(f"'encoder' is {list(encoder)} in a file of kind '{kind}'")
-
-        observation = table["observation"]
-        _check_keys(observation, ("size", "actor_size"), "'observation'")
-        obs_dim = _size(observation["size"], "'size' of 'observation'")
-        actor_dim = _size(observation["actor_size"], "'actor_size'")
-        if actor_dim > obs_dim:
-            raise PolicyFileError(f"'actor_size' {actor_dim} is more than the {obs_dim} there are")
-
-        action = table["action"]
-        _check_keys(action, ("size", "low", "high"), "'action'")
-        action_dim = _size(action["size"], "'size' of 'action'")
-        low = _bounds(action["low"], action_dim, -math.inf, "'low'")
-        high = _bounds(action["high"], action_dim, math.inf, "'high'")
-        if any(lo > hi for lo, hi in zip(low, high, strict=True)):
-            raise PolicyFileError("'low' of 'action' is above 'high'")
-        header = cls(
-            kind=kind,
-            activation=arch["activation"],
-            actor=_sizes(arch["actor"], "'actor'"),
-            critic=_sizes(arch["critic"], "'critic'"),
-            lstm=None if arch["lstm"] is None else _size(arch["lstm"], "'lstm'"),
-            obs_dim=obs_dim,
-            actor_dim=actor_dim,
-            low=low,
-            high=high,
-            meta=meta,
-            mirror=_mirror(table["mirror"], actor_dim, action_dim),
-            encoder=encoder,
-        )
+        table = _table(text)
+        parts = {
+            **_architecture(table["architecture"], table["kind"]),
+            **_observation(table["observation"]),
+            **_action(table["action"]),
+        }
+        mirror = _mirror(table["mirror"], parts["actor_dim"], len(parts["low"]))
+        header = cls(kind=table["kind"], meta=table["meta"], mirror=mirror, **parts)
         if header.nbytes() > _MAX_WEIGHT_BYTES:
             raise PolicyFileError(f"{header.nbytes()} bytes of weights, too large to be a policy")
-        return header, sha256
+        return header, table["sha256"]
+
+
+def _table(text: str) -> dict[str, Any]:
+    """The table in a header's text, once its format, version and kind are known to be right."""
+    try:
+        table = json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise PolicyFileError(f"not JSON ({_one_line(error)})") from None
+    if not isinstance(table, dict) or table.get("format") != FORMAT:
+        raise PolicyFileError(f"not a {FORMAT} file")
+    version = table.get("version")
+    if not isinstance(version, int) or isinstance(version, bool) or version != VERSION:
+        raise PolicyFileError(f"format version {_shown(version)}; this code reads {VERSION}")
+    keys = ("format", "version", "kind", "architecture", "observation", "action", "mirror",
+            "sha256", "meta")  # fmt: skip
+    _check_keys(table, keys, "the file")
+    if table["kind"] not in KINDS:
+        raise PolicyFileError(f"kind {_shown(table['kind'])}; known: {', '.join(KINDS)}")
+    for key, kind, what in (("sha256", str, "a string"), ("meta", dict, "a table")):
+        if not isinstance(table[key], kind):
+            raise PolicyFileError(f"'{key}' must be {what}, not {_shown(table[key])}")
+    return table
+
+
+def _architecture(arch: Any, kind: str) -> dict[str, Any]:
+    """Fields of ``Header`` from a table 'architecture' in a file of this kind."""
+    if isinstance(arch, dict):
+        arch = {"encoder": []} | arch  # older files have no encoder
+    _check_keys(arch, ("activation", "actor", "critic", "lstm", "encoder"), "'architecture'")
+    if not isinstance(arch["activation"], str) or arch["activation"] not in ACTIVATIONS:
+        known = ", ".join(ACTIVATIONS)
+        raise PolicyFileError(f"activation {_shown(arch['activation'])}; known: {known}")
+    if (arch["lstm"] is not None) != (kind == "lstm"):
+        raise PolicyFileError(f"'lstm' is {_shown(arch['lstm'])} in a file of kind '{kind}'")
+    encoder = _sizes(arch["encoder"], "'encoder'")
+    if encoder and kind != "lstm":
+        raise PolicyFileError(f"'encoder' is {list(encoder)} in a file of kind '{kind}'")
+    return {
+        "activation": arch["activation"],
+        "actor": _sizes(arch["actor"], "'actor'"),
+        "critic": _sizes(arch["critic"], "'critic'"),
+        "lstm": None if arch["lstm"] is None else _size(arch["lstm"], "'lstm'"),
+        "encoder": encoder,
+    }
+
+
+def _observation(table: Any) -> dict[str, Any]:
+    """Fields of ``Header`` from a table 'observation'."""
+    _check_keys(table, ("size", "actor_size"), "'observation'")
+    obs_dim = _size(table["size"], "'size' of 'observation'")
+    actor_dim = _size(table["actor_size"], "'actor_size'")
+    if actor_dim > obs_dim:
+        raise PolicyFileError(f"'actor_size' {actor_dim} is more than the {obs_dim} there are")
+    return {"obs_dim": obs_dim, "actor_dim": actor_dim}
+
+
+def _action(table: Any) -> dict[str, Any]:
+    """Fields of ``Header`` from a table 'action'."""
+    _check_keys(table, ("size", "low", "high"), "'action'")
+    size = _size(table["size"], "'size' of 'action'")
+    low = _bounds(table["low"], size, -math.inf, "'low'")
+    high = _bounds(table["high"], size, math.inf, "'high'")
+    if any(lo > hi for lo, hi in zip(low, high, strict=True)):
+        raise PolicyFileError("'low' of 'action' is above 'high'")
+    return {"low": low, "high": high}
 
 
 def _no_constant(name: str) -> float:

@@ -1,4 +1,4 @@
-"""Terrain tiles and the curriculum grid (Sec. III-A), in plain numpy.
+"""Terrain tiles (Sec. III-A), in plain numpy.
 
 A tile is a height field h(x, y) of 8 m x 8 m; x is the direction of travel. Its layout along x is
 
