@@ -29,7 +29,7 @@ from tdgc.tasks.leaps import DURATION
 from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask, make_task
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_spaces
 from tdgc.tasks.low_statistics import summarise
-from tdgc.tasks.rules import is_fallen
+from tdgc.tasks.rules import FELL, is_fallen
 from tdgc.tasks.tiles import shallow
 
 NOMINAL = nominal_pose(RobotConfig())
@@ -861,7 +861,7 @@ def test_falls_of_free_commands_drawn_for_the_first_time_are_remembered(
     task = begin(TILES, 3, training=True)
     task.episodes.crossing[:] = [False, True, False]
     task.episodes.retried[:] = [False, False, True]
-    monkeypatch.setattr(low_env, "is_fallen", lambda world: np.ones(3, dtype=bool))
+    monkeypatch.setattr(low_env, "outcome", lambda world: np.full(3, FELL))
     asked = task.locomotion.command[0].copy()
     task.step(still(task))
     found = task.commands.falls[task.commands.falls[:, 0] >= 0.0]

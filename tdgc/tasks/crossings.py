@@ -172,14 +172,8 @@ class Crossings:
         due = e.leaping & (e.elapsed % self._config.leap_decimation == 0)
         rows = crossing[due[crossing]]
         if rows.size:
-            motion = Motion(
-                (state.position[:, 0] - e.origin[:, 0])[rows],
-                state.heading_vel[rows, 0],
-                e.speed[rows],
-                loco.clock.clock[rows],
-                loco.command[rows, _FREQUENCY],
-                loco.command[rows, _LENGTH],
-            )
+            x = (state.position[:, 0] - e.origin[:, 0])[rows]
+            motion = Motion.of(loco, rows, x, state.heading_vel[rows, 0], e.speed[rows])
             frequency, length = self._plan.steps(rows, motion, self.landing)
             loco.command[rows, _FREQUENCY], loco.command[rows, _LENGTH] = frequency, length
 

@@ -51,6 +51,7 @@ _LENGTH_PRICE = 2.0  # 1/m^2, for the squared distance of rear feet from where t
 # 4 with neither rule, 23 and 5 with the first alone (21 and 8 with 0.5 of the cycle), and 24 and 11
 # with both at 0.5 of the cycle (docs/experiments.md).
 _DECIDED, _CHANGE_PRICE = 0.4, 0.5
+_STRIDE = [INDEX["frequency"], INDEX["stance_length"]]
 FREQUENCIES, LENGTHS = 25, 11  # how many are tried at each decision, evenly over the command ranges
 # How leaping robots speed up, from two low policies: 0.8, 1.1 and 1.2 m/s at the first landings
 # from rest, and 1.14 m/s in the long run when 1.2 is commanded. Without this model, landings at a
@@ -153,6 +154,14 @@ class Motion(NamedTuple):
     clock: Array
     frequency: Array
     length: Array
+
+    @classmethod
+    def of(
+        cls, loco: Locomotion, rows: NDArray[np.integer], x: Array, speed: Array, commanded: Array
+    ) -> "Motion":
+        """The motion of the robots ``rows`` (n,), with their own clocks and strides."""
+        frequency, length = loco.command[rows][:, _STRIDE].T
+        return cls(x, speed, commanded, loco.clock.clock[rows], frequency, length)
 
 
 class Lesson(NamedTuple):

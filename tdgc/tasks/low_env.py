@@ -31,7 +31,7 @@ from tdgc.tasks.low_observation import CRITIC_LAYOUT, CriticSources, low_spaces
 from tdgc.tasks.low_rewards import LowStep, low_terms, total
 from tdgc.tasks.low_statistics import by_gait
 from tdgc.tasks.pushes import Pushes
-from tdgc.tasks.rules import episode_steps, is_fallen
+from tdgc.tasks.rules import COLLIDED, FELL, LEFT_TILE, episode_steps, outcome
 from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.tiles import FLAT, TrainingTiles, shallow
@@ -178,8 +178,10 @@ class LowLevelTask:
         self.ground = measure_ground(loco)
         terms = low_terms(self._low_step(speed), c.rewards)
         reward = total(terms, c.rewards, c.physics.control_dt, self._penalty())
-        terminated = is_fallen(loco.world)
-        truncated = ~terminated & ((e.elapsed >= self.horizon) | self._left_tile() | e.reached)
+        ended = outcome(loco.world)
+        terminated = np.isin(ended, (FELL, COLLIDED))
+        over = (e.elapsed >= self.horizon) | (ended == LEFT_TILE) | e.reached
+        truncated = ~terminated & over
         self._count(terms, reward, terminated)
         e.tilts[:] = np.roll(e.tilts, 1, axis=1)
         e.tilts[:, 0] = loco.world.state.gravity[:, :2]
@@ -203,12 +205,6 @@ class LowLevelTask:
                 self._draw_commands(due)
         everyone = np.arange(self.num_robots)
         self.crossings.steer(self.locomotion, self.ground, everyone)
-
-    def _left_tile(self) -> NDArray[np.bool_]:
-        if self.field is None:
-            return np.zeros(self.num_robots, dtype=bool)
-        x, y = self.locomotion.world.state.position[:, :2].T
-        return ~self.field.on_tile(np.arange(self.num_robots), 0, x, y)
 
     def _move_levels(self, failed: NDArray[np.bool_], ended: NDArray[np.bool_]) -> None:
         e = self.episodes

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import CommandRanges, TeacherConfig
-from tdgc.sim.commands import CONTINUOUS, INDEX, command_bounds, default_command
+from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
@@ -168,10 +168,7 @@ class Teacher:
         self._origin = field.origin(np.arange(m), 0)
         commands = np.array([style.command() for style in (skill.uneven, SLOPING, LEAPING)])
         # The low policy may have been trained on narrower ranges than the styles use.
-        bounds = command_bounds(ranges)
-        behaviour = commands[:, : len(CONTINUOUS)]
-        np.clip(behaviour, bounds[:, 0], bounds[:, 1], out=behaviour)
-        self._uneven, self._sloping, self._leap = commands
+        self._uneven, self._sloping, self._leap = CommandDecoder(ranges).nearest(commands)
         self.speed = np.zeros(m)
         self.price = np.zeros((m, FREQUENCIES, LENGTHS))
         self.other = np.zeros((m, len(default_command())))
@@ -242,9 +239,7 @@ class Teacher:
             ways = bearing[rows], state.yaw[rows]
             steer_leap(leaps, *ways, self._ranges, self._wanted_speed)
             commanded = np.full(len(rows), self._leap_speed)
-            stride = loco.command[rows][:, [INDEX["frequency"], INDEX["stance_length"]]].T
-            clock = loco.clock.clock[rows]
-            motion = Motion(local[rows, 0], self.speed[rows], commanded, clock, *stride)
+            motion = Motion.of(loco, rows, local[rows, 0], self.speed[rows], commanded)
             lesson = self._plan.lesson(rows, motion, self._landing)
             leap_command(leaps, lesson.frequency, lesson.length)
             command[rows], self.price[rows] = leaps, lesson.price
