@@ -26,7 +26,7 @@ from tdgc.sim.terrain import (
     make_tile,
     tile_rng,
 )
-from tdgc.sim.world import CLIENT_ROBOTS, World
+from tdgc.sim.world import CLIENT_ROBOTS, PLANE_CLIENT_ROBOTS, World
 from tdgc.tasks.rules import is_fallen
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()
@@ -549,7 +549,8 @@ def trajectory(
 @pytest.mark.parametrize("terrain", [False, True])
 def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> None:
     """Robots that stumble in two clients move alike to the last bit, but not without ``forget``."""
-    m, rng = CLIENT_ROBOTS + 1, np.random.default_rng(0)
+    m = 1 + (CLIENT_ROBOTS if terrain else PLANE_CLIENT_ROBOTS)
+    rng = np.random.default_rng(0)
     field = tiles((["rough", "stair", "gap"] * m)[:m], level=6) if terrain else None
     world = World(m, ROBOT, PHYSICS, field)
     xy = np.column_stack([np.arange(m), np.zeros(m)])
@@ -657,7 +658,7 @@ def test_the_same_seed_gives_the_same_bits_here_and_in_another_process() -> None
 
 
 def test_bullet_time_is_counted_and_clients_are_closed() -> None:
-    world = World(11, ROBOT, PHYSICS)
+    world = World(PLANE_CLIENT_ROBOTS + 1, ROBOT, PHYSICS)
     assert world.bullet_seconds == 0.0
     hold(world)
     assert world.bullet_seconds > 0.0

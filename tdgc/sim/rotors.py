@@ -31,18 +31,21 @@ def excess_momentum(body_rate: Array, q: Array, qd: Array) -> tuple[Array, Array
     """
     hip, thigh, calf = qd[:, 0::3], qd[:, 1::3], qd[:, 2::3]
     roll, pitch, yaw = body_rate.T[..., None]
-    cos, sin = np.cos(q[:, 0::3]), np.sin(q[:, 0::3])
+    angle = q[:, 0::3]
+    cos, sin = np.cos(angle), np.sin(angle)
     # w of the three joints. Thigh and calf turn about the hip's leftward axis.
     of_thigh = cos * pitch + sin * yaw
     of_calf = of_thigh + thigh
-    momentum, force = np.zeros((len(q), 15)), np.zeros((len(q), 15))
+    momentum, force = np.empty((len(q), 15)), np.zeros((len(q), 15))
     momentum[:, 0:12:3] = roll
     momentum[:, 1:12:3] = of_thigh + calf + 2.0 * of_calf  # w of the calf changes with the thigh
     momentum[:, 2:12:3] = of_calf
     leftward = thigh + calf + 2.0 * (of_thigh + of_calf)
-    trunk = momentum[:, 12:]
-    trunk[:, 0] = (hip + 2.0 * roll).sum(axis=1)
-    trunk[:, 1], trunk[:, 2] = (cos * leftward).sum(axis=1), (sin * leftward).sum(axis=1)
+    x, y, z = momentum[:, 12:].T  # of the trunk
+    x[:] = (hip + 2.0 * roll).sum(axis=1)
+    y[:], z[:] = (cos * leftward).sum(axis=1), (sin * leftward).sum(axis=1)
     force[:, 0:12:3] = -leftward * (cos * yaw - sin * pitch)
-    force[:, 12:] = np.cross(body_rate, trunk)
+    # The body's rate times the trunk's momentum; np.cross takes half as long as all of the rest.
+    a, b, c = body_rate.T
+    force[:, 12], force[:, 13], force[:, 14] = b * z - c * y, c * x - a * z, a * y - b * x
     return momentum, force

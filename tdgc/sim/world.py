@@ -80,16 +80,18 @@ class _Client:
 
 #: Robots per Bullet client. For each robot's island Bullet walks all constraints of the client, so
 #: the time per robot grows with their number. Measured on a plane, a step takes 44 us per robot
-#: with 5 robots in a client, 46 with 10, 54 with 25, 75 with 50 and 122 with 100.
-CLIENT_ROBOTS = 10
+#: with 5 robots in a client, 46 with 10, 54 with 25, 75 with 50 and 122 with 100. Python's share is
+#: larger now that rotors are simulated, and Bullet's is smaller on a plane: there 36 robots are
+#: 12 % faster in two clients than in four.
+CLIENT_ROBOTS, PLANE_CLIENT_ROBOTS = 10, 20
 
 
 class World:
     """M robots on a plane, or each on its own row of tiles in a field.
 
-    Robots are spread over Bullet clients with at most ``CLIENT_ROBOTS`` each; a client holds only
-    its own robots' part of the field. ``visual`` loads what pictures need, ``window`` opens
-    Bullet's own window.
+    Robots are spread over Bullet clients with at most ``CLIENT_ROBOTS`` each, or
+    ``PLANE_CLIENT_ROBOTS`` on a plane; a client holds only its own robots' part of the field.
+    ``visual`` loads what pictures need, ``window`` opens Bullet's own window.
 
     Raises:
         ConfigError: the robot's URDF is missing, or not of a robot that this package can drive.
@@ -127,7 +129,7 @@ class World:
         self._clients: list[_Client] = []
         self._bodies: list[int] = []
         self._client_of: list[_Client] = []
-        parts = -(-num_robots // CLIENT_ROBOTS)
+        parts = -(-num_robots // (PLANE_CLIENT_ROBOTS if field is None else CLIENT_ROBOTS))
         try:
             with merged_file(urdf) as file:
                 for rows in np.array_split(np.arange(num_robots), parts):
