@@ -454,7 +454,7 @@ def test_the_scripts_command_as_the_teacher_of_the_high_policy_did(low, tmp_path
     del header["meta"]["teacher"]["leap_speed"]
     high.with_suffix(".json").write_text(json.dumps(header), encoding="utf-8")
     assert evaluate.main(flags) == 2
-    assert "high, meta.teacher: no key 'leap_speed'" in capsys.readouterr().err
+    assert "high, meta.teacher: the key 'leap_speed' is missing" in capsys.readouterr().err
 
 
 def test_the_window_shows_the_tuned_policy(monkeypatch):

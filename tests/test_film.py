@@ -265,7 +265,7 @@ def test_a_strip_shows_all_policies_on_one_tile(tmp_path: Path) -> None:
     assert (shots[0][0] != shots[1][0]).any(axis=-1).mean() < 0.05
     assert (shots[1][0] != shots[1][4]).any(axis=-1).mean() > 0.05
     assert film.moments(ours) == [0, 8, 15, 22, 30]
-    with pytest.raises(ValueError, match="of one tile, not of 2"):
+    with pytest.raises(ValueError, match="a strip shows one tile, not 2"):
         film.strip([ours, planted(family="stair")], tmp_path)
     assert film.strip([planted(condition="pushes")], tmp_path).name == "strip_gap_8_pushes.png"
 
