@@ -356,6 +356,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise ConfigError("--resume keeps the run's settings: no --preset or --no-teacher")
         start = with_overrides(HighTrainConfig(), preset)
         config = configure(start if args.resume else with_low(start, args.assignments), args)
+        config = dataclasses.replace(config, low=config.low or find_low())
         low, low_config = load_low(cast(str, config.low))
         config = pin_low(config)
         tqdm.write(f"low policy: {config.low}")

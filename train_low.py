@@ -84,11 +84,6 @@ def check(config: LowTrainConfig) -> None:
         )
     check_families(config.env.families)
     check_levels(config.env.levels)
-    if config.env.first_levels > config.env.levels:
-        raise ConfigError(
-            f"'env.first_levels' must be at most the {config.env.levels} levels, "
-            f"not {config.env.first_levels}"
-        )
     check_robot(config.env.robot, config.env.physics, config.env.randomisation)
 
 

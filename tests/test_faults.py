@@ -54,6 +54,17 @@ def fragile() -> Iterator[TaskVecEnv]:
 # ------------------------------------------------------------------ workers
 
 
+def test_the_step_of_the_last_fault_counts_for_other_robots(fragile: TaskVecEnv) -> None:
+    fragile.reset()
+    for _ in range(2):
+        step(fragile, actions(r3=RAISE))
+    with pytest.raises(WorkerError):
+        step(fragile, actions(r1=0.5, r3=RAISE))
+    first, broken = fragile.state_dicts()
+    assert first["lengths"].tolist() == [3, 3] and first["returns"].tolist() == [3.0, 2.5]
+    assert fragile.starts().tolist() == [False, False, True, True] and "episodes" not in broken
+
+
 def test_episodes_that_end_with_the_last_fault_are_over(fragile: TaskVecEnv) -> None:
     """The checkpoint after it begins new ones; a robot that blows up ends those of its worker."""
     fragile.reset()

@@ -1,5 +1,6 @@
 """Worker processes: they compute what the tasks compute, and how they fail."""
 
+import contextlib
 import functools
 import multiprocessing
 import os
@@ -16,6 +17,7 @@ import pytest
 from stubs import Counter, make_counter, make_failing
 
 from tdgc.config import LowLevelConfig, PhysicsConfig
+from tdgc.parallel import worker
 from tdgc.parallel.vec import TaskVecEnv, worker_seed
 from tdgc.parallel.worker import ProcessLink, WorkerError
 from tdgc.state import split
@@ -248,6 +250,21 @@ def test_signals_to_workers_that_start_are_the_parents_to_answer() -> None:
     env = TaskVecEnv(make_counter, 2, 1, seed=3, spaces=SPACES, link=InterruptedLink)
     assert env.reset().shape == (2, 3)
     env.close()
+
+
+def test_an_interrupt_while_a_worker_starts_leaves_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is held back until the worker has started, which would then wait for its parent."""
+
+    @contextlib.contextmanager
+    def interrupted(needed: Any) -> Iterator[None]:
+        yield
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(worker, "_without_script", interrupted)
+    before = set(multiprocessing.active_children())
+    with pytest.raises(KeyboardInterrupt):
+        TaskVecEnv(make_counter, 2, 1, seed=3, spaces=SPACES)
+    assert set(multiprocessing.active_children()) <= before
 
 
 @pytest.mark.parametrize("workers", [0, 4, -1])

@@ -120,7 +120,7 @@ class LowLevelConfig:
 
     terrain: Literal["plane", "tiles"] = "plane"
     levels: Count = 11  # in the curriculum: 0..levels-1
-    # Robots start spread over levels 0..first_levels-1.
+    # Robots start spread over levels 0..first_levels-1, or over all if there are fewer.
     first_levels: Count = field(default=3, metadata={"before": 3})
     # No Pillar: a policy that cannot see obstacles learns nothing there but collisions. Stair and
     # Gap count twice, because they are still being learned when slopes are already easy.

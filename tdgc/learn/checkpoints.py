@@ -142,13 +142,12 @@ class Checkpoint:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
-            if final.exists():  # of the same step; out of the way in an instant
-                os.replace(final, folder / f".{final.name}-before.partial")
+            shutil.rmtree(final, ignore_errors=True)
             os.replace(partial, final)
         except OSError:
             shutil.rmtree(partial, ignore_errors=True)  # it may be what filled the disk
             raise
-        for old in (*sorted(folder.glob("step-*"))[:-_KEEP], *folder.glob(".step-*.partial")):
+        for old in sorted(folder.glob("step-*"))[:-_KEEP]:
             shutil.rmtree(old)
         return final
 

@@ -110,8 +110,9 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
 
 
 def _has_begun(run: Path) -> bool:
-    """Whether there is anything to lose in a run folder: a checkpoint, or a row of the log."""
-    return (run / "log.jsonl").exists() or any((run / "checkpoints").glob("step-*"))
+    """Whether there is anything to lose in a run folder: a checkpoint, a log or a policy."""
+    files = any((run / name).exists() for name in ("log.jsonl", "policy.json"))
+    return files or any((run / "checkpoints").glob("step-*"))
 
 
 def check_device(name: str) -> None:

@@ -173,8 +173,6 @@ class Run:
                 finished = learn(model, callback, phase.until)
             except WorkerError:
                 callback.tell_faults()
-                callback.num_timesteps = model.num_timesteps
-                callback.log()
                 callback.save()
                 raise
             # A phase's policy is kept beside those of later phases.
@@ -287,9 +285,9 @@ class RunCallback(BaseCallback):
         policies.save(self.run.folder / name, policy, {**self.run.meta, **progress})
 
     def log(self) -> None:
-        """Write a log row about the steps and faults since the last row, if there are any."""
+        """Write a log row about the steps since the last row, if there are any."""
         steps, seconds = self._logged_at
-        if steps == self.num_timesteps and not self._faults:
+        if steps == self.num_timesteps:
             return
         sums: dict[str, float] = {}
         for part in self.env.stats():

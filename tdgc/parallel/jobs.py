@@ -37,7 +37,7 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
         except BaseException:  # the jobs under way are no longer needed
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(mp.active_children()) - others:
-                process.kill()  # it ignores SIGTERM
+                process.kill()  # it blocks SIGTERM
             raise
 
 

@@ -240,15 +240,15 @@ class TaskVecEnv(VecEnv):
     def step_wait(self) -> Any:
         self._receive_all()
         self._steps += 1
-        views = self._views
+        views, fatal = self._views, None
         if self._broken:
-            seen = views["obs"].copy()
+            seen, lost = views["obs"].copy(), np.zeros(self.num_envs, dtype=bool)
+            for worker in self._broken:
+                lost[self._rows[worker]] = True
             try:
                 lost = self._mend()
-            except WorkerError:  # a checkpoint follows: the other robots' new episodes begin
-                over = (views["terminated"] | views["truncated"]).astype(bool)
-                self._returns[over], self._lengths[over] = 0.0, 0
-                raise
+            except WorkerError as error:  # the step still counts: a checkpoint follows
+                fatal = error
             views["last_obs"][lost] = seen[lost]
             views["rewards"][lost] = 0.0
             views["terminated"][lost], views["truncated"][lost] = False, True
@@ -265,6 +265,8 @@ class TaskVecEnv(VecEnv):
             }
         self._returns[done] = 0.0
         self._lengths[done] = 0
+        if fatal is not None:
+            raise fatal
         return views["obs"].copy(), views["rewards"].copy(), done, infos
 
     def stats(self) -> list[dict[str, float]]:

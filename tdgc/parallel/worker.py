@@ -367,9 +367,15 @@ class ProcessLink:
             daemon=True,
             name=f"tdgc-worker-{worker}",
         )
-        with one_blas_thread(), signals_left_to_parent(), _without_script(beginning.make_task):
-            self._process.start()
-        theirs.close()
+        try:
+            with one_blas_thread(), signals_left_to_parent(), _without_script(beginning.make_task):
+                self._process.start()
+        except BaseException:  # such as a signal that was held back
+            if self._process.pid is not None:
+                self.end(0.0)
+            raise
+        finally:
+            theirs.close()
 
     @property
     def pid(self) -> int:

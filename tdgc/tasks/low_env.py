@@ -79,7 +79,7 @@ class LowLevelTask:
         self.rng = np.random.default_rng(seed)
         self.horizon = episode_steps(config.episode_seconds, config.physics.control_dt)
         self._command_steps = round(config.command_seconds / config.physics.control_dt)
-        self.level = self.rng.integers(0, config.first_levels, m)
+        self.level = self.rng.integers(0, min(config.first_levels, config.levels), m)
         self.column = (first + np.arange(m)) % len(config.families)
         on_tiles = config.terrain == "tiles"
         families = [config.families[c] if on_tiles else FLAT for c in self.column]
