@@ -183,16 +183,12 @@ class TaskVecEnv(VecEnv):
         self._send(word)
         return self._receive_all()
 
-    def _mend(self) -> NDArray[np.bool_]:
+    def _mend(self) -> None:
         """Restart the broken workers; their robots get new observations.
-
-        Returns:
-            (num_envs,) which robots are affected.
 
         Raises:
             WorkerError: there were too many faults.
         """
-        concerned = np.zeros(self.num_envs, dtype=bool)
         while self._broken:
             broken = sorted(self._broken.items())
             self._fault_steps.append(self._steps)
@@ -208,8 +204,6 @@ class TaskVecEnv(VecEnv):
                 self.faults.append(Fault(worker, str(fault), restarts, seed))
             for worker, _ in broken:
                 self._receive(worker, _START_SECONDS)
-                concerned[self._rows[worker]] = True
-        return concerned
 
     # ------------------------------------------------------------------ SB3's interface
 
@@ -246,7 +240,7 @@ class TaskVecEnv(VecEnv):
             for worker in self._broken:
                 lost[self._rows[worker]] = True
             try:
-                lost = self._mend()
+                self._mend()
             except WorkerError as error:  # the step still counts: a checkpoint follows
                 fatal = error
             views["last_obs"][lost] = seen[lost]

@@ -207,7 +207,7 @@ def joint_accelerations(s: LowStep) -> Array:
 
 def power(s: LowStep) -> Array:
     """Mechanical power at the commanded price: power_weight * sum |torque * speed|."""
-    return s.cmd("power_weight") * np.sum(np.abs(s.state.torque * s.state.qd), axis=1)
+    return s.cmd("power_weight") * s.state.power
 
 
 #: Terms of the low policy by name; the weights are the fields of ``LowRewardConfig``.
