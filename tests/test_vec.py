@@ -255,7 +255,7 @@ def test_signals_to_workers_that_start_are_the_parents_to_answer() -> None:
 @pytest.mark.usefixtures("signals")
 def test_an_interrupt_while_a_worker_starts_leaves_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is held back until the worker has started, which would then wait for its parent."""
-    # Python installs it itself, unless it was started in a shell's background, which ignores SIGINT.
+    # Python installs it itself, unless it was started where the shell ignores SIGINT.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
     @contextlib.contextmanager
