@@ -69,6 +69,7 @@ HIGH = (
 )
 ONE = "--episodes 1 --workers 1"
 FALL = f"--policies gp --families gap --levels 10 {ONE}"  # into the first trench, within seconds
+CLUMSY = "--low runs/low/policy"  # trained for 128 steps: off its tile within two seconds
 #: Commands that are run, in order: some need what those before them leave.
 RUNS: dict[str, Run] = {
     "python train_low.py": Run(
@@ -119,7 +120,7 @@ RUNS: dict[str, Run] = {
     ".venv/bin/python evaluate.py --families stair,gap --levels 6 --episodes 1 "
     "--policies tdgc --video": Run(FALL, ("runs/evaluation/report.html",)),
     "python evaluate.py --video --families stair,gap --levels 8": Run(
-        FALL,
+        f"{FALL} {CLUMSY}",
         (
             "runs/evaluation/films/film_gp_nominal_gap_10_000.mp4",
             "runs/evaluation/films/sheet_gp_nominal_gap_10_000.png",
@@ -127,20 +128,24 @@ RUNS: dict[str, Run] = {
         ),
     ),
     "python evaluate.py --trace failed --out runs/traced": Run(
-        FALL, ("runs/traced/diagnosis.csv", "runs/traced/traces/gp_nominal_gap_10_000.parquet")
+        f"{FALL} {CLUMSY}",
+        ("runs/traced/diagnosis.csv", "runs/traced/traces/gp_nominal_gap_10_000.parquet"),
     ),
     "python evaluate.py --policies teacher --families stair,gap --episodes 20": Run(
         f"--families gap --levels 6 {ONE}", ("runs/evaluation/summary.json",)
     ),
     "python evaluate.py --policies tdgc --set decoder.vx.high=0.6 --set safety.max_tilt=0.5": (
-        Run(f"--levels 0 --families rough {ONE}", ("runs/evaluation/tuning.json",))
+        Run(
+            f"--levels 0 --families rough {ONE} {CLUMSY} --high runs/high/policy",
+            ("runs/evaluation/tuning.json",),
+        )
     ),
     "python evaluate.py --families hills.npy": Run(
-        f"--levels 5 --policies gp {ONE}", ("runs/evaluation/trajectories.png",)
+        f"--levels 5 --policies gp {ONE} {CLUMSY}", ("runs/evaluation/trajectories.png",)
     ),
     "python evaluate.py --families ripples.npy,cobbles.npy,logs.npy,terraces.npy,dome.npy,"
     "bridge.npy,walls.npy,crates.npy": Run(
-        f"--levels 5 --policies gp {ONE}", ("runs/evaluation/summary.json",)
+        f"--levels 5 --policies gp {ONE} {CLUMSY}", ("runs/evaluation/summary.json",)
     ),
     "python train_low.py --set env.robot.urdf=a1/a1.urdf --out runs/a1_low": Run(
         LOW, ("runs/a1_low/policy.safetensors",)
