@@ -18,8 +18,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from tqdm import tqdm
-
 from tdgc.benchmark import diagnosis, tuning
 from tdgc.benchmark.cues import CuesLaw
 from tdgc.benchmark.diagnosis import Diagnosis, diagnose
@@ -251,18 +249,15 @@ class Evaluation:
         if "tdgc" in self.policies:  # refuse a misfit before anything is tried out
             assert self.high is not None
             pair = load_high(self.high, low, config)
-        skill = self.skill(low, config) if {CUES, TEACHER} & set(self.policies) else None
+        skill = functools.cache(lambda: self.skill(low, config))  # may be found by trials
         for name in self.policies:
             if name == "gp":
                 drivers[name] = BaselineDriver(bounds=config.commands)
             elif name == TEACHER:
-                assert skill is not None
-                drivers[name] = TeacherDriver(config, skill)
+                drivers[name] = TeacherDriver(config, skill())
             elif name == CUES:
                 mdp = HighLevelConfig(commands=config.commands)
-                assert skill is not None
-                law = CuesLaw(config, skill, mdp)
-                drivers[name] = HierarchyDriver(law, mdp)
+                drivers[name] = HierarchyDriver(CuesLaw(config, skill(), mdp), mdp)
             else:
                 drivers[name] = HierarchyDriver(*pair)
                 if self.tuning is not None:
@@ -343,11 +338,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     episodes: list[Episode] = []
     recordings: list[Recording] = []
     diagnoses: list[Diagnosis] = []
-    total = sum(cell.count for cell in cells)
-    with (
-        salvage(out, episodes, cells, trained_on),
-        tqdm(total=total, unit="episode", dynamic_ncols=True) as bar,
-    ):
+    with salvage(out, episodes, cells, trained_on) as bar:
         for ran in e.run_jobs(work, cells, e.workers):
             for trace in ran.traces:
                 write(trace, out / "traces")

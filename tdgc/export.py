@@ -427,7 +427,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     differences: list[Array] = []
     seconds: list[float] = []
     log: list[tuple[bool, dict[str, Array]]] = []
-    step, ended = 0, True
+    ended = True
     try:
         for _ in range(controller.horizon):
             if ended:
@@ -436,14 +436,12 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
                 loco.place(np.arange(1), start[:, :2], start[:, 2], np.zeros(1))
                 differences.append(world.state.q[0] - nominal_pose(world.robot))
                 driver.begin(loco, goal, _CHECKED_ON)
-                step = 0
             readings = controller.sense(world.state, goal[0], _CHECKED_ON, world.ground_height)
             controller.step(readings)
             seconds.append(controller.seconds)
             log.append((ended, readings))
-            driver.command(step)
+            driver.command(controller.count - 1)
             differences += _act(pair, controller, driver, loco)
-            step += 1
             ended = bool(outcome(world, goal)[0] != GOING)
     finally:
         world.close()

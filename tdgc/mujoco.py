@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from tdgc.benchmark import flags
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import Batch, Cell, Episode, EpisodeLog, Watcher, closed_loop, plan
+from tdgc.benchmark.evaluation import Batch, Cell, Episode, Watcher, closed_loop, plan
 from tdgc.benchmark.recording import Recorder, Recording
 from tdgc.benchmark.results import STOPS, describe, make_room, salvage, what_stopped, write_results
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
@@ -126,14 +125,10 @@ def run_episode(
     batch = Batch(
         cell, low, seed, make_world=lambda f: MujocoWorld(robot, physics, f, config, visual)
     )
-    episode = EpisodeLog(batch)
-    pair.begin(batch.loco, batch.goal, batch.told)
-    for watcher in watchers:
-        watcher.begin(batch)
-    closed_loop(pair, pair, batch, episode, watchers)
+    (episode,) = closed_loop(pair, pair, batch, watchers)
     if pair.log is not None:
         pair.log.end(pair.readings())
-    return episode.episodes()[0]
+    return episode
 
 
 def run_cell(
@@ -182,11 +177,7 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     )
     episodes: list[Episode] = []
     recordings: list[Recording] = []
-    total = sum(cell.count for cell in cells)
-    with (
-        salvage(args.out, episodes, cells),
-        tqdm(total=total, unit="episode", dynamic_ncols=True) as bar,
-    ):
+    with salvage(args.out, episodes, cells) as bar:
         for ran, recorded in run_jobs(work, cells, args.workers):
             episodes += ran
             recordings += recorded
@@ -263,10 +254,9 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
     for flag, value in (("--video", args.video), ("--log", args.log)):
         if args.gui and value:
             raise ValueError(f"--gui only shows the robot: no {flag}")
-    config = with_overrides(MujocoConfig(), args.assignments)
-    for key in ("armature", "joint_friction"):
-        if getattr(args, key) is not None:
-            config = with_overrides(config, [f"{key}={getattr(args, key)}"])
+    given = {key: getattr(args, key) for key in ("armature", "joint_friction")}
+    flagged = [f"{key}={value}" for key, value in given.items() if value is not None]
+    config = with_overrides(MujocoConfig(), [*args.assignments, *flagged])
     controller = load(args.export)
     controller.robot()
     config.physics(controller.dt, controller.low.table["joint_control"]["rate"]["value"])

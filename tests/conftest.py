@@ -10,14 +10,16 @@ import pytest
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # After the above, since they import numpy and PyTorch.
-from stubs import in_this_process
+from stubs import InlineLink, in_this_process
 
 import evaluate
+from tdgc.show import film
+from tdgc.tasks import leaps
 
 #: The slowest files, slowest first. Run in this order, no process is left without work at the end.
 SLOWEST = (
-    "training", "readme", "cluster", "world", "low_env", "faults", "evaluation", "high_env",
-    "export", "diagnosis", "mujoco", "ablate", "calibration", "cues", "vec",
+    "readme", "cluster", "training", "world", "calibration", "cues", "evaluation", "diagnosis",
+    "deploy", "imitation", "film", "export", "ablate", "manners", "vec", "low_env",
 )  # fmt: skip
 ORDER = {f"test_{name}.py": place for place, name in enumerate(SLOWEST)}
 
@@ -35,6 +37,19 @@ def signals() -> Iterator[None]:
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let evaluate.py run its jobs in this process."""
     monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
+    monkeypatch.setattr(film, "run_jobs", in_this_process)
+
+
+@pytest.fixture
+def inline_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let trainings collect in this process."""
+    monkeypatch.setattr("tdgc.learn.flags.ProcessLink", InlineLink)
+
+
+@pytest.fixture
+def quick_landing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure a low policy's landings for half a second, for tests that do not depend on them."""
+    monkeypatch.setattr(leaps, "_SECONDS", 2.0)  # the first 1.5 s are not measured
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

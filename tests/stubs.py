@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from tdgc.parallel.worker import Arrays, Beginning, Worker
 from tdgc.sim.robot import Array
 from tdgc.state import State
 
@@ -155,6 +156,41 @@ def make_counter(robots: int, seed: int, first: int = 0) -> Counter:
 
 def make_failing(where: str, robots: int, seed: int, first: int = 0) -> Counter:
     return Counter(robots, seed, fails=where)
+
+
+class InlineLink:
+    """A worker in this process, as ``ProcessLink`` without a process, which takes seconds to import
+    PyTorch. What a task raises is raised here."""
+
+    pid = os.getpid()
+
+    def __init__(self, worker: int, arrays: Arrays, beginning: Beginning) -> None:
+        self._worker = Worker(arrays.views(beginning.rows), beginning)
+        self._answer: Any = self._worker.task.state_dict()
+
+    def send(self, word: str, argument: Any = None) -> None:
+        if word != "close":
+            self._answer = self._worker.answer(word, argument)
+
+    def receive(self, timeout: float) -> Any:
+        return self._answer
+
+    def end(self, timeout: float) -> None:
+        self._worker.task.close()
+
+
+def double(number: int) -> int:
+    if number < 0:
+        raise ValueError("a negative number")
+    return 2 * number
+
+
+def die(number: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def no_task(config: Any, robots: int, seed: int, first: int) -> Any:
+    raise RuntimeError(f"no robots today, not even {robots}")
 
 
 def in_this_process(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stubs import in_this_process
 
-import evaluate
 import train_high
 from tdgc import policies
 from tdgc.ablate.__main__ import choose, main, plan, without_missing
@@ -137,6 +135,7 @@ TINY = [
 ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("in_process", "inline_workers")
 def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -145,7 +144,6 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     One of its trials cannot run. Its policy is byte for byte the one that train_high.py trains.
     """
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
     out = tmp_path / "ablation"
     command = [*TINY, "--only", "full,fixed-pose,uncalibrated", "--seeds", "5", "--out", str(out)]
     asked = []
@@ -194,6 +192,7 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     )
 
 
+@pytest.mark.usefixtures("in_process", "inline_workers")
 def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -202,7 +201,6 @@ def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
     So ``full`` fails, and with it ``fixed-pose``, which needs it; ``gp`` needs no training.
     """
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
     flags = [*TINY, "--set", "ppo.minibatches=5", "--only", "full,fixed-pose,gp"]
     assert main([*flags, "--out", str(tmp_path)]) == 1
     table = json.loads((tmp_path / "ablation.json").read_text())["rows"]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from sb3_contrib import RecurrentPPO
+from stubs import no_task
 
 from tdgc import bench
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
@@ -127,10 +128,6 @@ def test_what_cannot_be_used_is_one_line_before_anything_is_measured(
     said = capsys.readouterr()
     assert (said.out, said.err) == ("", f"tdgc.bench: {message.format(tmp_path)}")
     assert not (tmp_path / "out").exists()
-
-
-def no_task(config: LowLevelConfig, robots: int, seed: int, first: int) -> LowLevelTask:
-    raise RuntimeError(f"no robots today, not even {robots}")
 
 
 def test_a_worker_that_fails_is_one_line(

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import ray
 from ray.cluster_utils import Cluster
-from stubs import HANG, RAISE, Fragile
+from stubs import HANG, RAISE, Fragile, die, double
 from test_faults import SPACES, actions, drawn, step
 from test_training import TINY, at_calls, final
 
@@ -300,16 +300,6 @@ def test_bench_compares_the_cluster_with_this_machine(
 
 
 # ------------------------------------------------------------------ evaluation
-
-
-def double(number: int) -> int:
-    if number < 0:
-        raise ValueError("a negative number")
-    return 2 * number
-
-
-def die(number: int) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_jobs_are_done_in_order_and_fail_as_they_do_here(

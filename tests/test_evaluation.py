@@ -436,6 +436,7 @@ def test_the_teacher_leads_on_any_terrain(tmp_path):
     assert "mixed" in {family for family, _ in outcomes}
 
 
+@pytest.mark.usefixtures("quick_landing")
 def test_the_scripts_command_as_the_teacher_of_the_high_policy_did(low, tmp_path, capsys):
     """A high policy of another robot had a teacher that walked, stepped and leapt differently."""
     config, high = load_low(low)[1], tmp_path / "high"
@@ -594,7 +595,7 @@ def test_a_training_may_rewrite_the_policy_meanwhile(low, tmp_path, monkeypatch)
     assert summary["editions"]["high"] == 2 and summary["tdgc"]["nominal"]["mean"]["n"] == 4
 
 
-@pytest.mark.usefixtures("in_process")
+@pytest.mark.usefixtures("in_process", "quick_landing")
 def test_cues_are_a_policy_of_the_script(tmp_path, capsys):
     flags = ["--levels", "4", "--families", "pillar", "--episodes", "1", "--workers", "1"]
     assert evaluate.main([*flags, "--policies", "cues", "--out", str(tmp_path)]) == 0

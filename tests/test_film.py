@@ -13,7 +13,6 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
-from stubs import in_this_process
 
 import evaluate
 from tdgc.benchmark import evaluation
@@ -294,11 +293,14 @@ def test_a_sheet_has_the_bars_that_were_planted(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ the script
 
 
+@pytest.fixture(autouse=True)
+def evaluations_in_process(in_process: None) -> None:
+    """Let evaluate.py run its jobs in this process, in all tests of this file."""
+
+
 def evaluate_short(out: Path, monkeypatch: pytest.MonkeyPatch, *flags: str) -> int:
     """Run the script in this process: two policies, one cell each, episodes of 0.1 s."""
     monkeypatch.setattr(evaluation, "HORIZON", 0.1)
-    monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
-    monkeypatch.setattr(film, "run_jobs", in_this_process)
     monkeypatch.setattr(film, "ENDING_SECONDS", 0.04)
     small = ["--levels", "10", "--families", "gap", "--episodes", "2", "--workers", "1"]
     return evaluate.main([*small, "--out", str(out), *flags])

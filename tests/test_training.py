@@ -538,6 +538,7 @@ def test_the_manner_of_the_teacher(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert manner(alone, tmp_path / "high") == TeacherConfig(leap_speed=1.0)
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_from_scratch_on_terrain_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -577,6 +578,7 @@ def test_from_scratch_on_terrain_of_ones_own(
     assert final(broken) == final(whole)
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_calibration_ends_a_run_of_the_low_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -584,8 +586,8 @@ def test_calibration_ends_a_run_of_the_low_policy(
     monkeypatch.setattr(calibration, "_EPOCHS", 2)
     monkeypatch.setattr(calibration, "_CORRECTIONS", 4)
     monkeypatch.setattr(calibration, "_ROBOTS", 12)
-    monkeypatch.setattr(calibration, "_WALK_SECONDS", 1.5)
-    monkeypatch.setattr(calibration, "_SETTLE_SECONDS", 0.7)
+    monkeypatch.setattr(calibration, "_WALK_SECONDS", 0.3)
+    monkeypatch.setattr(calibration, "_SETTLE_SECONDS", 0.1)
     monkeypatch.setattr(calibration, "run_jobs", in_this_process)
     arguments = [*TINY, "--steps", "32", "--set", "calibration.robots=64"]
     arguments += ["--set", "calibration.turns=1"]
@@ -800,6 +802,7 @@ def test_a_run_that_cannot_begin_leaves_its_folder_free(
     assert not (tmp_path / "run" / "config.json").exists()
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_flags_come_after_a_preset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path)]
     preset = ["--preset", "paper", "--seed", "7", "--n-envs", "4", "--workers", "1"]
@@ -864,6 +867,7 @@ def test_the_low_policy_is_what_the_first_command_left(
     assert train_high.find_low() == "runs/low/policy"
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_one_range_may_be_narrowed_and_the_others_stay_the_low_policys(tmp_path: Path) -> None:
     low = policies.load(PRETRAINED / "low")
     wide = dataclasses.replace(CommandRanges(), vy=(-0.4, 0.4), pitch=(-0.2, 0.1))
@@ -877,6 +881,7 @@ def test_one_range_may_be_narrowed_and_the_others_stay_the_low_policys(tmp_path:
     assert used == dataclasses.replace(wide, vx=(-0.5, 0.5))
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_a_curve_that_cannot_be_drawn_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

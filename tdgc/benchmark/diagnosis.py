@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from tdgc.benchmark.evaluation import Episode, EpisodeRecord, tile_of
+from tdgc.benchmark.evaluation import Episode, EpisodeRecord
 from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
 from tdgc.files import atomic
 from tdgc.sim.robot import Array
@@ -134,9 +135,7 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
 
 def tile_under(trace: Trace) -> Tile | None:
     """Return the tile of an episode; None if it was not on a tile."""
-    if trace.seed == NO_TILE:
-        return None
-    return tile_of(trace.seed, trace.family, trace.level, trace.episode, trace.condition)
+    return None if trace.seed == NO_TILE else trace.tile()
 
 
 # ---------------------------------------------------------------------------- which layer
@@ -146,9 +145,9 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
     """Return the layer and cause, and the evidence."""
     intervals = judged(trace)
     held, at_trench = held_up(trace, tile, hips), False
-    if tile is not None:
+    if tile is not None and trace.outcome != "left_tile":
         away = to_trenches(tile, trace["base_x"][-1]).min(initial=np.inf)
-        at_trench = bool(away < hips + REACH) and trace.outcome != "left_tile"
+        at_trench = bool(away < hips + REACH)
     errors = tracking_errors(trace, intervals & free(trace, tile, hips))
     limits = {
         name: limit.episode if trace.outcome == "timeout" else limit.stretch
@@ -192,12 +191,12 @@ def judged(trace: Trace) -> NDArray[np.bool_]:
     """
     time = trace["time"].astype(np.float64)
     last = time[1:] > (0.0 if trace.outcome == "timeout" else time[-1] - LOOK_BACK)
-    return np.asarray(last & settled(trace))
+    return last & settled(trace)
 
 
 def settled(trace: Trace) -> NDArray[np.bool_]:
     """Mask of the intervals between decisions, (n - 1,), that begin after ``SETTLE``."""
-    return np.asarray(trace["time"][:-1].astype(np.float64) > SETTLE - 1e-6)
+    return trace["time"][:-1].astype(np.float64) > SETTLE - 1e-6
 
 
 def tracking_errors(trace: Trace, intervals: NDArray[np.bool_]) -> dict[str, float]:
@@ -227,9 +226,8 @@ def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
     Without any interval, the mean is over the whole episode.
     """
     bearing = trace["goal_bearing"][:-1]
-    towards = trace["command_vx"][:-1] * np.cos(bearing) + trace["command_vy"][:-1] * np.sin(
-        bearing
-    )
+    vx, vy = trace["command_vx"][:-1], trace["command_vy"][:-1]
+    towards = vx * np.cos(bearing) + vy * np.sin(bearing)
     if not intervals.any():
         intervals = np.ones_like(intervals)
     return float(np.average(towards[intervals], weights=trace["seconds"][1:][intervals]))
@@ -249,7 +247,7 @@ def held_up(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
         return np.zeros(len(x), dtype=bool)
     if is_map(trace.family):
         return to_obstacles(tile, x, y) < hips + REACH
-    return np.asarray(to_pillars(tile, x, y).min(axis=1, initial=np.inf) < hips + REACH)
+    return to_pillars(tile, x, y).min(axis=1, initial=np.inf) < hips + REACH
 
 
 def free(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
@@ -265,7 +263,7 @@ def near_edge(trace: Trace, hips: float) -> NDArray[np.bool_]:
     feet have no ground."""
     x, y = trace["base_x"], trace["base_y"]
     inside = np.minimum(np.minimum(x, TILE_SIZE - x), np.minimum(y, TILE_SIZE - y))
-    return np.asarray(inside < hips)
+    return inside < hips
 
 
 def _evidence(
@@ -326,31 +324,27 @@ def to_trenches(tile: Tile, x: ArrayLike) -> Array:
     """Distances along the tile, in m, from ``x`` (...) m to the k trenches, (..., k)."""
     begin, end = tile.features.trenches.T
     along = np.asarray(x)[..., None]
-    return np.asarray(np.maximum(np.maximum(begin - along, along - end), 0.0))
+    return np.maximum(np.maximum(begin - along, along - end), 0.0)
 
 
 def to_pillars(tile: Tile, x: ArrayLike, y: ArrayLike) -> Array:
     """Distances in m from points (...) to the surfaces of the k pillars, (..., k)."""
     px, py, diameter = tile.features.pillars.T
     away = np.hypot(np.asarray(x)[..., None] - px, np.asarray(y)[..., None] - py)
-    return np.asarray(np.maximum(away - 0.5 * diameter, 0.0))
+    return np.maximum(away - 0.5 * diameter, 0.0)
 
 
 def to_obstacles(tile: Tile, x: Array, y: Array) -> Array:
     """Distances in m from points (n,) to the nearest wall, see ``_TALL``, that is higher than the
     ground at the point; infinite where there is none."""
     heights, n = tile.heights, len(tile.heights)
-    padded = np.pad(heights, _STEEP, mode="edge")
-    shifts = range(2 * _STEEP + 1)
-    lowest = np.min([padded[i : i + n, j : j + n] for i in shifts for j in shifts], axis=0)
-    walls = np.argwhere(heights - lowest > _TALL)
+    around = sliding_window_view(np.pad(heights, _STEEP, mode="edge"), (2 * _STEEP + 1,) * 2)
+    walls = np.argwhere(heights - around.min(axis=(2, 3)) > _TALL)
     tops = heights[tuple(walls.T)]
     at = np.stack([x, y], axis=1)
     under = heights[tuple(np.clip(np.rint(at / CELL), 0, n - 1).astype(int).T)]
     away = np.linalg.norm(CELL * walls - at[:, None], axis=2)
-    return np.asarray(
-        np.where(tops > under[:, None] + _TALL, away, np.inf).min(axis=1, initial=np.inf)
-    )
+    return np.where(tops > under[:, None] + _TALL, away, np.inf).min(axis=1, initial=np.inf)
 
 
 # ---------------------------------------------------------------------------- results
@@ -377,9 +371,9 @@ def count_failures(
         episodes: rows of episodes.csv, failed or not.
     """
     result = []
-    for policy, condition in dict.fromkeys((e["policy"], e["condition"]) for e in episodes):
+    totals = Counter((e["policy"], e["condition"]) for e in episodes)
+    for (policy, condition), total in totals.items():
         mine = [d for d in diagnoses if (d["policy"], d["condition"]) == (policy, condition)]
-        total = sum((e["policy"], e["condition"]) == (policy, condition) for e in episodes)
         cells = []
         for family, level in dict.fromkeys((d["family"], d["level"]) for d in mine):
             cell = [d for d in mine if (d["family"], d["level"]) == (family, level)]

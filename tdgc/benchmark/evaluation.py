@@ -108,15 +108,9 @@ class Cell:
 
     def record(self, k: int, seed: int, outcome: int) -> dict[str, Any]:
         """Return robot k's fields of ``EpisodeRecord``; ``outcome`` indexes ``OUTCOMES``."""
-        return {
-            "policy": self.policy,
-            "condition": self.condition,
-            "family": self.family,
-            "level": self.level,
-            "episode": self.first + k,
-            "seed": seed,
-            "outcome": OUTCOMES[outcome],
-        }
+        names = ("policy", "condition", "family", "level")
+        where = {name: getattr(self, name) for name in names}
+        return where | {"episode": self.first + k, "seed": seed, "outcome": OUTCOMES[outcome]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +125,15 @@ class EpisodeRecord:
     episode: int
     seed: int
     outcome: str
+
+    @property
+    def where(self) -> str:
+        """Tile and condition, as text for people."""
+        return f"{self.family}, level {self.level}, {self.condition}, episode {self.episode}"
+
+    def tile(self) -> Tile:
+        """The tile of the episode."""
+        return tile_of(self.seed, self.family, self.level, self.episode, self.condition)
 
     @property
     def name(self) -> str:
@@ -163,9 +166,7 @@ class Episode(EpisodeRecord):
 
     def row(self) -> dict[str, Any]:
         """Return the row of episodes.csv, with one column per gait share."""
-        beside = ("shares", "goal", "track")
-        names = [f.name for f in dataclasses.fields(self) if f.name not in beside]
-        row = {name: getattr(self, name) for name in names}
+        row = {f.name: getattr(self, f.name) for f in dataclasses.fields(EpisodeRecord)}
         row["time_s"], row["path_m"] = round(self.time_s, 2), round(self.path_m, 3)
         row["energy_j"] = round(self.energy_j, 1)
         return row | {f"share_{g}": round(x, 4) for g, x in zip(GAITS, self.shares, strict=True)}
@@ -374,28 +375,23 @@ def run_cell(
     """
     batch = Batch(cell, load_low(low)[1], seed)
     try:
-        driver.begin(batch.loco, batch.goal, batch.told, batch.probes)
-        for watcher in watchers:
-            watcher.begin(batch)
-        log = EpisodeLog(batch)
-        closed_loop(driver, Executor(batch.loco, low, batch.sensors), batch, log, watchers)
+        return closed_loop(driver, Executor(batch.loco, low, batch.sensors), batch, watchers)
     finally:
         batch.loco.world.close()
-    return log.episodes()
 
 
 def closed_loop(
-    driver: Driver,
-    executor: Carries,
-    batch: Batch,
-    log: EpisodeLog,
-    watchers: Sequence[Watcher] = (),
-) -> None:
+    driver: Driver, executor: Carries, batch: Batch, watchers: Sequence[Watcher]
+) -> list[Episode]:
     """Run the paper's closed loop (Sec. IV) until every episode of a batch has ended."""
+    driver.begin(batch.loco, batch.goal, batch.told, batch.probes)
+    for watcher in watchers:
+        watcher.begin(batch)
+    log = EpisodeLog(batch)
     for step in itertools.count():
         live = log.live
         if not live.size:
-            return
+            break
         batch.push(step, live)
         # At each decision: cues -> high policy -> decoder -> commands, held until the next one.
         commands = driver.command(step)
@@ -405,6 +401,7 @@ def closed_loop(
         for watcher in watchers:
             watcher.step(step, live, log.outcome)
         batch.loco.world.retire(np.setdiff1d(live, log.live))
+    return log.episodes()
 
 
 # ---------------------------------------------------------------------------- the whole table

@@ -90,22 +90,13 @@ class Recorder:
     def recordings(self) -> list[Recording]:
         """Return the recordings of the last batch watched, in order."""
         batch, loco = self._batch, self._batch.loco
-        bounds = command_bounds(self._driver.bounds)
         result = []
-        for k in self._rows:
+        for k in self._rows.tolist():
             steps = self._kept[: self._steps[k]]
-            arrays: dict[str, Any] = {
-                key: np.array([step[key][k] for step in steps]) for key in steps[0]
-            }
-            result.append(
-                Recording(
-                    **batch.cell.record(int(k), batch.seed, self._outcome[k]),
-                    robot=loco.robot,
-                    dt=loco.physics.control_dt,
-                    bounds=bounds,
-                    **arrays,
-                )
-            )
+            fields = batch.cell.record(k, batch.seed, self._outcome[k])
+            fields |= {key: np.array([step[key][k] for step in steps]) for key in steps[0]}
+            fields |= {"robot": loco.robot, "dt": loco.physics.control_dt}
+            result.append(Recording(**fields, bounds=command_bounds(self._driver.bounds)))
         return result
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
@@ -26,6 +27,8 @@ PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
 # The rule of dominance (TDGC-Bench): ``tdgc`` is nowhere significantly below ``gp``. Its lead over
 # ``cues`` is what learning adds to the cues.
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
+
+_Where = tuple[str, str, int, int]
 
 
 def make_room(out: Path, patterns: Sequence[str], folders: Mapping[str, bool]) -> None:
@@ -53,40 +56,36 @@ def compare(episodes: Iterable[Episode], first: str, second: str) -> dict[str, A
     Raises:
         ValueError: only one of the policies was run on some tile.
     """
-    reached: dict[str, dict[tuple[str, str, int, int], bool]] = {first: {}, second: {}}
-    for e in episodes:
-        if e.policy in reached:
-            where = e.condition, e.family, e.level, e.episode
-            reached[e.policy][where] = e.outcome == "reached"
-    if reached[first].keys() != reached[second].keys():
+    reached = _reached(episodes, "condition", "policy")
+    if any((first in found) != (second in found) for found in reached.values()):
         raise ValueError(f"{first} and {second} were not on the same tiles")
-    tree: dict[str, Any] = {}
-    for where, one in reached[first].items():
-        condition, family, *_ = where
-        tiles = tree.setdefault(condition, {}).setdefault(family, [])
-        tiles.append((one, reached[second][where]))
-    return _with_differences(tree)
+    return _differences_of(reached, first, second)
 
 
 def sides(episodes: Iterable[Episode]) -> dict[str, Any]:
     """Compare tiles' mirror images with the tiles themselves, which shows what a policy has learned
     for one side only: policy -> family -> ``difference``, with "mean" over the families."""
-    reached: dict[tuple[str, str, int, int], dict[str, bool]] = {}
+    return _differences_of(_reached(episodes, "policy", "condition"), "mirrored", "nominal")
+
+
+def _reached(episodes: Iterable[Episode], of: str, side: str) -> dict[_Where, dict[str, bool]]:
+    """Whether the goal was reached: (``of``, family, level, episode) -> ``side`` -> that."""
+    reached: dict[_Where, dict[str, bool]] = {}
     for e in episodes:
-        if e.condition in ("mirrored", "nominal"):
-            images = reached.setdefault((e.policy, e.family, e.level, e.episode), {})
-            images[e.condition] = e.outcome == "reached"
+        where = getattr(e, of), e.family, e.level, e.episode
+        reached.setdefault(where, {})[getattr(e, side)] = e.outcome == "reached"
+    return reached
+
+
+def _differences_of(
+    reached: dict[_Where, dict[str, bool]], first: str, second: str
+) -> dict[str, Any]:
+    """``difference`` of two sides, where there are both: key -> family -> that, with "mean"."""
     tree: dict[str, Any] = {}
-    for (policy, family, *_), images in reached.items():
-        if len(images) == 2:
-            pair = images["mirrored"], images["nominal"]
-            tree.setdefault(policy, {}).setdefault(family, []).append(pair)
-    return _with_differences(tree)
-
-
-def _with_differences(tree: dict[str, Any]) -> dict[str, Any]:
-    """Replace pairs of outcomes by their ``difference``: key -> family -> pairs, with "mean" over
-    the families added to each key."""
+    for (key, family, *_), found in reached.items():
+        if first in found and second in found:
+            pairs = tree.setdefault(key, {}).setdefault(family, [])
+            pairs.append((found[first], found[second]))
     for families in tree.values():
         every = [pair for pairs in families.values() for pair in pairs]
         families.update({family: difference(pairs) for family, pairs in families.items()})
@@ -211,15 +210,11 @@ def write_results(
         )
     summary = summarise(episodes)
 
-    def tiles(policy: str) -> set[tuple[str, str, int, int]]:
+    def tiles(policy: str) -> set[_Where]:
         mine = (e for e in episodes if e.policy == policy)
         return {(e.condition, e.family, e.level, e.episode) for e in mine}
 
-    pairs = [
-        (first, second)
-        for first, second in _PAIRS
-        if {first, second} <= summary.keys() and tiles(first) == tiles(second)
-    ]
+    pairs = [pair for pair in _PAIRS if tiles(pair[0]) == tiles(pair[1]) != set()]
     if pairs:
         summary[PAIRED] = {" - ".join(pair): compare(episodes, *pair) for pair in pairs}
     if found := sides(episodes):
@@ -239,9 +234,9 @@ def salvage(
     episodes: Sequence[Episode],
     cells: Sequence[Cell],
     editions: Mapping[str, int] | None = None,
-) -> Iterator[None]:
-    """Context for running episodes that keeps what is ``complete`` if one of ``STOPS`` occurs, or
-    if a robot or a terrain file cannot be used where the episodes run.
+) -> Iterator[tqdm]:
+    """Progress bar for running episodes that keeps what is ``complete`` if one of ``STOPS`` occurs,
+    or if a robot or a terrain file cannot be used where the episodes run.
 
     It then writes and prints the table of those episodes, adds a note with their number to the
     exception, and re-raises it.
@@ -251,10 +246,12 @@ def salvage(
         episodes: the episodes that have ended; the caller appends to it meanwhile.
         cells: all batches of the evaluation.
     """
+    total = sum(cell.count for cell in cells)
     try:
-        yield
+        with tqdm(total=total, unit="episode", dynamic_ncols=True) as bar:
+            yield bar
     except (*STOPS, InputError) as error:
-        done, total = complete(episodes, cells), sum(cell.count for cell in cells)
+        done = complete(episodes, cells)
         if done:
             print(describe(write_results(folder, done, editions)))
             error.add_note(f"the table has {len(done)} of {total} episodes")

@@ -54,6 +54,13 @@ _COMMANDS = tuple(f"command_{name}" for name in NAMES)
 _AT_BOUND = tuple(f"at_bound_{name}" for name in CONTINUOUS)
 _PROBES = tuple(f"probe_{i:02d}" for i in range(NUM_PROBES))
 _REWARDS = tuple(f"reward_{name}" for name in HIGH_TERMS)
+# Means over the control steps of a decision, in the order of ``Tracer._measure``.
+_MEANS = (
+    *(f"error_{name}" for name in TRACKED),
+    *(f"contact_{foot}" for foot in FEET),
+    *(f"match_{foot}" for foot in FEET),
+    "power",
+)
 
 
 def _columns() -> Iterator[Column]:
@@ -73,17 +80,15 @@ def _columns() -> Iterator[Column]:
         yield Column(name, "m", meaning)
     for name in _ACTIONS:
         yield Column(name, "1", "action of the policy, before decoding")
-    for name, unit in zip(NAMES, UNITS, strict=True):
-        yield Column(f"command_{name}", unit, "command, as executed")
-    unit = UNITS[INDEX["frequency"]]
-    yield Column("asked_frequency", unit, "command, as requested")
+    for name, unit in zip(_COMMANDS, UNITS, strict=True):
+        yield Column(name, unit, "command, as executed")
+    yield Column("asked_frequency", UNITS[INDEX["frequency"]], "command, as requested")
     yield Column("gait", "", "gait commanded")
-    for name in CONTINUOUS:
-        yield Column(f"at_bound_{name}", "1", "-1 or 1 if at its lower or upper bound, else 0")
+    for name in _AT_BOUND:
+        yield Column(name, "1", "-1 or 1 if at its lower or upper bound, else 0")
     yield Column("seconds", "s", "since the previous decision, which the columns below describe")
     for name in TRACKED:
-        unit = UNITS[INDEX[name]]
-        yield Column(f"error_{name}", unit, "mean of measured minus commanded")
+        yield Column(f"error_{name}", UNITS[INDEX[name]], "mean of measured minus commanded")
     for foot in FEET:
         yield Column(f"contact_{foot}", "1", "share of the time in contact")
     for foot in FEET:
@@ -195,7 +200,6 @@ class Tracer:
         decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
         self._rewards = HighReward(config, decoder, m, seconds)
         self._steps = np.zeros(m, dtype=int)
-        self._decisions = np.zeros(m, dtype=int)
         self._outcome = np.full(m, -1)
         self._rows: list[dict[str, NDArray[Any]]] = []
         self._clear()
@@ -203,7 +207,7 @@ class Tracer:
 
     def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
         if step % self._decimation == 0:
-            self._decide(live)
+            self._decide()
         self._measure(live)
         self._outcome = outcome.copy()
         if (step + 1) % self._decimation == 0:
@@ -215,8 +219,9 @@ class Tracer:
             self._look()
         cell, result, driver = self._batch.cell, [], self._driver
         places = "" if driver.probes is None else probe_places(PROBES[driver.config.probes])
+        decisions = -(-self._steps // self._decimation)  # the last one may have been cut short
         for k in range(cell.count):
-            rows = self._rows[: self._decisions[k] + 1]
+            rows = self._rows[: decisions[k] + 1]
             columns: dict[str, NDArray[Any]] = {}
             for c in COLUMNS:
                 kind = object if c.name in _TEXT else np.float32
@@ -231,15 +236,11 @@ class Tracer:
 
     def _clear(self) -> None:
         m = self._loco.num_robots
-        self._count = np.zeros(m)
-        self._error = np.zeros((m, len(TRACKED)))
-        self._contact, self._match = np.zeros((m, 4)), np.zeros((m, 4))
-        self._power = np.zeros(m)
+        self._count, self._sums = np.zeros(m), np.zeros((m, len(_MEANS)))
 
-    def _decide(self, live: NDArray[np.intp]) -> None:
+    def _decide(self) -> None:
         """Add the decision just taken to the latest row, which holds the state it was based on."""
         row, command, driver = self._rows[-1], self._loco.command, self._driver
-        self._decisions[live] += 1
         if driver.action is not None:
             row.update(action_columns(driver.action))
         row.update(command_columns(command, self._loco.carried_out, driver.bounds))
@@ -257,12 +258,11 @@ class Tracer:
             [*state.heading_vel[:, :2].T, state.ang_vel[:, 2], height, *tilt(state.gravity)], axis=1
         )
         wanted = loco.command[:, [INDEX[name] for name in TRACKED]]
+        match = state.touching == (loco.clock.contact > 0.5)
+        values = np.column_stack([measured - wanted, state.touching, match, state.power])
         self._steps[live] += 1
         self._count[live] += 1.0
-        self._error[live] += (measured - wanted)[live]
-        self._contact[live] += state.touching[live]
-        self._match[live] += (state.touching == (loco.clock.contact > 0.5))[live]
-        self._power[live] += state.power[live]
+        self._sums[live] += values[live]
         self._rewards.measure(state, live)
 
     def _look(self) -> None:
@@ -289,14 +289,9 @@ class Tracer:
     def _add_execution(self, row: dict[str, NDArray[Any]]) -> None:
         count = np.where(self._count > 0.0, self._count, np.nan)  # 0: has already ended
         row["seconds"] = self._dt * count
-        for k, name in enumerate(TRACKED):
-            row[f"error_{name}"] = self._error[:, k] / count
-        for k, foot in enumerate(FEET):
-            row[f"contact_{foot}"] = self._contact[:, k] / count
-            row[f"match_{foot}"] = self._match[:, k] / count
+        row.update(zip(_MEANS, self._sums.T / count, strict=True))
         force = self._rewards.force
         row["trunk_force"], row["leg_force"] = force[:, 0].copy(), force[:, 1:].max(axis=1)
-        row["power"] = self._power / count
         # As in training, a decision that ends early is rewarded for its full duration.
         share = np.full(len(count), len(self._rows) / self._horizon)
         for name, value in self._rewards.terms(self._loco, self._batch.goal, share).items():
@@ -338,12 +333,9 @@ def _fields() -> list[tuple[str, Any, dict[str, str]]]:
     """Name, type and metadata of each column in a file."""
     import pyarrow as pa
 
+    number, text = pa.float32(), pa.string()
     return [
-        (
-            c.name,
-            pa.float32() if c.unit else pa.string(),
-            {"unit": c.unit, "description": c.meaning},
-        )
+        (c.name, number if c.unit else text, {"unit": c.unit, "description": c.meaning})
         for c in COLUMNS
     ]
 

@@ -277,14 +277,10 @@ def record(tuning: Tuning) -> dict[str, Any]:
     """The keys of a tuning that differ from their defaults, as JSON."""
 
     def changed(now: dict[str, Any], default: dict[str, Any]) -> dict[str, Any]:
-        kept = {}
-        for key, value in now.items():
-            if isinstance(value, dict):
-                value = changed(value, default[key])
-                if value:
-                    kept[key] = value
-            elif value != default[key]:
-                kept[key] = value
-        return kept
+        return {
+            key: changed(value, default[key]) if isinstance(value, dict) else value
+            for key, value in now.items()
+            if value != default[key]
+        }
 
     return changed(to_dict(tuning), to_dict(Tuning()))

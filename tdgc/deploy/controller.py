@@ -134,19 +134,18 @@ def _open_onnx(path: Path, table: Table) -> Run:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # its exceptions share no base class of their own
         raise ExportError(f"{path}: no ONNX graph") from error
-    for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
-        if [(s["name"], s["shape"]) for s in table[side]] != [(x.name, x.shape) for x in found]:
-            raise ExportError(f"{path}: its {side} are not those of its interface file")
     # The session is bound to these arrays, since naming and wrapping new ones takes a sixth of a
     # step.
     binding = session.io_binding()
     given, made = ([np.zeros(s["shape"]) for s in table[side]] for side in ("inputs", "outputs"))
-    for signal, array in zip(table["inputs"], given, strict=True):
-        memory = onnxruntime.OrtValue.ortvalue_from_numpy(array)
-        binding.bind_ortvalue_input(signal["name"], memory)
-    for signal, array in zip(table["outputs"], made, strict=True):
-        memory = onnxruntime.OrtValue.ortvalue_from_numpy(array)
-        binding.bind_ortvalue_output(signal["name"], memory)
+    for side, found, arrays, bind in (
+        ("inputs", session.get_inputs(), given, binding.bind_ortvalue_input),
+        ("outputs", session.get_outputs(), made, binding.bind_ortvalue_output),
+    ):
+        if [(s["name"], s["shape"]) for s in table[side]] != [(x.name, x.shape) for x in found]:
+            raise ExportError(f"{path}: its {side} are not those of its interface file")
+        for signal, array in zip(table[side], arrays, strict=True):
+            bind(signal["name"], onnxruntime.OrtValue.ortvalue_from_numpy(array))
 
     def run(values: list[Array]) -> list[Array]:
         for array, value in zip(given, values, strict=True):
@@ -250,8 +249,7 @@ class Controller:
         """Begin a new episode, with the gait clock at ``clock`` or as the interface specifies."""
         for graph in self._graphs.values():
             graph.reset()
-        if clock is not None:
-            for graph in self._graphs.values():
+            if clock is not None:
                 graph.memory["clock"] = np.array([clock])
         self.count, self.commands, self.decided, self.seconds = 0, self._stand, False, 0.0
         self._reached_at: int | None = None
@@ -317,7 +315,7 @@ class Controller:
         for name in due:
             self._graphs[name].check(readings)
         readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
-        self.decided, self.seconds = False, 0.0
+        self.decided, self.seconds = "high" in due, 0.0
         for name in due:
             graph = self._graphs[name]
             taken = {
@@ -329,7 +327,6 @@ class Controller:
                 taken["commands"] = self._stand
             graph(readings | taken)
             self.seconds += graph.seconds
-            self.decided |= name == "high"
         self.commands = self.low.values["commands"]
         self.count += 1
         return self.low.values["joint_targets"]

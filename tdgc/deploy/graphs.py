@@ -276,19 +276,13 @@ class LowGraph(nn.Module):
         known = np.column_stack([np.ones(len(GAITS)), GAIT_TABLE])
         first, *gain = np.linalg.solve(known, np.arange(len(GAITS)) / (len(GAITS) - 1))
         self.gait_zero, self.gait_gain = _constant([first]), _constant(gain)
+        asked = "to follow in this step"
         self.inputs = [
             *_BODY,
             *([_GYRO] if config.gyro else []),
             Signal("last_action", NUM_JOINTS, "1", "the last action", "joints", "action", 0.0),
             Signal("action_before", NUM_JOINTS, "1", "before that", "joints", "last_action", 0.0),
-            Signal(
-                "commands",
-                NUM_COMMANDS,
-                None,
-                "to follow in this step",
-                "commands",
-                source="high.commands",
-            ),
+            Signal("commands", NUM_COMMANDS, None, asked, "commands", source="high.commands"),
             Signal("clock", 1, "1", "share of the gait cycle, in [0, 1)", None, "next_clock", 0.0),
         ]
         if self.counted:
@@ -304,9 +298,7 @@ class LowGraph(nn.Module):
             Signal("next_clock", 1, "1", "share of the gait cycle at the end of this step"),
         ]
         if self.counted:
-            self.outputs.append(
-                Signal("next_cycles", 1, "1", "of the gait so far, after this step")
-            )
+            self.outputs += [Signal("next_cycles", 1, "1", "of the gait so far, after this step")]
 
     def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
         """``inputs`` -> ``outputs``."""

@@ -17,13 +17,12 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
-from tdgc.benchmark.evaluation import tile_of
 from tdgc.benchmark.recording import Recording, runs_of_equal, spans
 from tdgc.config import PhysicsConfig, RobotConfig
 from tdgc.errors import InputError, require
 from tdgc.files import atomic
 from tdgc.parallel.jobs import run_jobs
-from tdgc.show.plots import GAIT_COLOURS, POLICY_COLOURS, sheet
+from tdgc.show.plots import DESIRED, GAIT_COLOURS, MEASURED, POLICY_COLOURS, sheet
 from tdgc.sim.commands import CONTINUOUS, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array
@@ -51,7 +50,6 @@ _TEXTURE = 1024  # pixels along a tile: 8 mm each
 _GRID = 0.5  # m between the lines on the ground
 _GROUND, _GOAL = (222, 213, 196), (0, 140, 90)
 _INK, _GREY, _PALE = (30, 34, 40), (125, 130, 138), (226, 228, 232)
-_WANTED, _MARK = (176, 205, 235), (213, 94, 0)  # desired contact; measured values
 
 _MEASURED = ("vx", "vy", "yaw_rate", "body_height")  # commands whose actual values are recorded
 
@@ -128,10 +126,9 @@ def set_stage(
 @contextlib.contextmanager
 def staged(recording: Recording, trail: bool = False) -> Iterator[Stage]:
     """Open the stage of ``recording``; ``trail`` paints the base's path on the ground."""
-    r = recording
-    tile = tile_of(r.seed, r.family, r.level, r.episode, r.condition)
     way = recording.position[:, :2] if trail else None
-    stage = set_stage(tile, recording.robot, way=way, colour=POLICY_COLOURS[recording.policy])
+    colour = POLICY_COLOURS[recording.policy]
+    stage = set_stage(recording.tile(), recording.robot, way=way, colour=colour)
     try:
         yield stage
     finally:
@@ -143,7 +140,7 @@ def camera_way(recording: Recording) -> Array:
     half = max(1, round(0.5 * _SMOOTHING / recording.dt))
     padded = np.pad(recording.position, ((half, half), (0, 0)), mode="edge")
     sums = np.cumsum(np.pad(padded, ((1, 0), (0, 0))), axis=0)
-    return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1))
+    return (sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1)
 
 
 def _shoot(
@@ -185,14 +182,13 @@ class Overlay:
         r, x0, x1 = self._recording, _SCENE[0] + 14, SIZE[0] - 14
         draw.text((x0, 12), r.policy, POLICY_COLOURS[r.policy], self._head)
         draw.text((x1, 16), f"{(i + 1) * r.dt:.2f} s", _INK, self._text, "ra")
-        where = f"{r.family}, level {r.level}, {r.condition}, episode {r.episode}"
-        draw.text((x0, 40), where, _INK, self._small)
+        draw.text((x0, 40), r.where, _INK, self._small)
         gait = int(self._gait[i])
         draw.rounded_rectangle([x0, 60, x0 + 74, 80], 6, GAIT_COLOURS[gait])
         draw.text((x0 + 37, 70), GAITS[gait], "black", self._text, "mm")
         draw.rectangle([x0 + 92, 64, x0 + 96, 76], _INK)
         draw.text((x0 + 102, 70), "commanded", _INK, self._small, "lm")
-        draw.ellipse([x0 + 186, 65, x0 + 196, 75], "white", _MARK, 2)
+        draw.ellipse([x0 + 186, 65, x0 + 196, 75], "white", MEASURED, 2)
         draw.text((x0 + 202, 70), "measured", _INK, self._small, "lm")
         for j, name in enumerate(CONTINUOUS):
             top = 92 + 27 * j
@@ -213,7 +209,7 @@ class Overlay:
                 draw.line([at(0.0), line - 3, at(0.0), line + 3], _GREY, 1)
             if name in self._measured:
                 x = at(float(self._measured[name][i]))
-                draw.ellipse([x - 5, line - 5, x + 5, line + 5], "white", _MARK, 2)
+                draw.ellipse([x - 5, line - 5, x + 5, line + 5], "white", MEASURED, 2)
             draw.rectangle([at(value) - 2, line - 6, at(value) + 2, line + 6], _INK)
 
     def _contacts(self, draw: ImageDraw.ImageDraw, i: int) -> None:
@@ -231,11 +227,11 @@ class Overlay:
             draw.text((14, y + 8), name, _INK, self._text, "lm")
             draw.rectangle([left, y, right, y + 16], (246, 247, 249))
             for a, b in spans(r.desired[seen, foot]):
-                draw.rectangle([begin + scale * a, y, begin + scale * b - 1, y + 16], _WANTED)
+                draw.rectangle([begin + scale * a, y, begin + scale * b - 1, y + 16], DESIRED)
             for a, b in spans(r.contact[seen, foot]):
                 draw.rectangle([begin + scale * a, y + 5, begin + scale * b - 1, y + 11], _INK)
         y = top + 12 + 20 * len(FEET) + 8
-        draw.rectangle([left, y - 5, left + 22, y + 5], _WANTED)
+        draw.rectangle([left, y - 5, left + 22, y + 5], DESIRED)
         draw.text((left + 28, y), "contact as the gait desires", _INK, self._small, "lm")
         draw.rectangle([left + 210, y - 3, left + 232, y + 3], _INK)
         draw.text((left + 238, y), "foot in contact", _INK, self._small, "lm")
@@ -335,8 +331,7 @@ def strip(recordings: Sequence[Recording], folder: Path) -> Path:
     width = left + _MOMENTS * (_SHOT[0] + gap)
     image = Image.new("RGB", (width, head + len(recordings) * (_SHOT[1] + gap)), "white")
     draw = ImageDraw.Draw(image)
-    title = f"{first.family}, level {first.level}, {first.condition}, episode {first.episode}"
-    draw.text((left, head // 2), title, _INK, _font(20, bold=True), "lm")
+    draw.text((left, head // 2), first.where, _INK, _font(20, bold=True), "lm")
     draw.text((width - gap, head // 2), "line: path of the base", _INK, _font(15), "rm")
     for row, r in enumerate(recordings):
         y = head + row * (_SHOT[1] + gap)

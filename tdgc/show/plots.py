@@ -4,9 +4,8 @@ import csv
 import json
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 
@@ -54,24 +53,16 @@ def _save(figure: Figure, out: Path) -> None:
 
 def _caption(figure: Figure, text: str) -> None:
     """Add a caption below the panels, wrapped to the figure's width."""
-    letters = int(
-        14 * figure.get_size_inches()[0]
-    )  # letters of 9 points, half as wide as tall, and a margin
+    # Letters of 9 points are half as wide as tall: 16 an inch, less a margin.
+    letters = int(14 * figure.get_size_inches()[0])
     figure.supxlabel(textwrap.fill(text, letters), fontsize=9)
 
 
 # ---------------------------------------------------------------------------- evaluation
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """An episode as written by ``tdgc.benchmark.results.write_results``.
-
-    Attributes:
-        row: of episodes.csv.
-        goal: (2,).
-        track: (n, 3).
-    """
+class _Run(NamedTuple):
+    """A row of episodes.csv, with goal (2,) and track (n, 3) from trajectories.npz."""
 
     row: dict[str, str]
     goal: Array
@@ -110,23 +101,20 @@ def success_by_level(summary: Path, out: Path) -> None:
     There is a row per condition and a column per family.
     """
     table = policies_of(json.loads(summary.read_text(encoding="utf-8")))
-    conditions = list(dict.fromkeys(c for rates in table.values() for c in rates))
-    families = {
-        condition: [f for f in next(iter(table.values()))[condition] if f != "mean"]
-        for condition in conditions
-    }
+    first = next(iter(table.values()))  # every policy is run in the same cells
+    families = {name: [f for f in rates if f != "mean"] for name, rates in first.items()}
     columns = max(map(len, families.values()))
     figure, axes = plt.subplots(
-        len(conditions),
+        len(families),
         columns,
-        figsize=(1.4 + 2.0 * columns, 0.6 + 2.2 * len(conditions)),
+        figsize=(1.4 + 2.0 * columns, 0.6 + 2.2 * len(families)),
         sharey=True,
         squeeze=False,
         layout="constrained",
     )
-    for row, condition in zip(axes, conditions, strict=True):
+    for row, (condition, names) in zip(axes, families.items(), strict=True):
         row[0].set_ylabel(f"{condition}\nsuccess (%)")
-        for axis, family in zip(row, families[condition], strict=False):
+        for axis, family in zip(row, names, strict=False):
             for k, (policy, rates) in enumerate(table.items()):
                 cells = {int(lv): c for lv, c in rates[condition][family].items() if lv != "mean"}
                 middle = np.array([100 * c["rate"] for c in cells.values()])
@@ -145,7 +133,7 @@ def success_by_level(summary: Path, out: Path) -> None:
                 axis.set_xticks(list(cells))
             axis.set(title=family, xlabel="level", ylim=(-3, 103))
             axis.grid(alpha=0.3)
-        for axis in row[len(families[condition]) :]:
+        for axis in row[len(names) :]:
             axis.set_axis_off()
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper")
@@ -297,10 +285,8 @@ def trajectories(folder: Path, out: Path) -> None:
 
 def _draw_track(axis: Any, run: _Run) -> None:
     """Draw the base's path, its heading once a second, the goal and the outcome."""
-    colour, white = (
-        POLICY_COLOURS[run.row["policy"]],
-        [withStroke(linewidth=3.5, foreground="white")],
-    )
+    colour = POLICY_COLOURS[run.row["policy"]]
+    white = [withStroke(linewidth=3.5, foreground="white")]
     x, y, yaw = run.track.T
     axis.plot(x, y, color=colour, linewidth=1.6, path_effects=white)
     second = slice(None, None, round(1.0 / POSE_SECONDS))
@@ -318,8 +304,8 @@ def _draw_track(axis: Any, run: _Run) -> None:
 
 # ---------------------------------------------------------------------------- one episode
 
-_MEASURED = "#D55E00"
-_DESIRED = "#B0CDEB"  # desired contact, drawn behind the actual one
+MEASURED = "#D55E00"
+DESIRED = "#B0CDEB"  # desired contact, drawn behind the actual one
 
 
 def sheet(recording: Recording, out: Path) -> None:
@@ -353,14 +339,13 @@ def sheet(recording: Recording, out: Path) -> None:
         axis.grid(axis="x", alpha=0.3)
     axes[-1].set_xlabel("time (s)", fontsize=8)
     axes[-1].set_xlim(0.0, ends[-1])
-    where = f"{r.family}, level {r.level}, {r.condition}, episode {r.episode}"
-    figure.suptitle(f"{r.policy}: {r.ending}   ({where}, seed {r.seed})", fontsize=11, y=0.99)
+    figure.suptitle(f"{r.policy}: {r.ending}   ({r.where}, seed {r.seed})", fontsize=11, y=0.99)
     handles = [
         *(Patch(color=GAIT_COLOURS[g], label=GAITS[g]) for g in np.unique(gait_index(r.command))),
-        Patch(color=_DESIRED, label="contact desired"),
+        Patch(color=DESIRED, label="contact desired"),
         Patch(color="black", label="in contact"),
         Line2D([], [], color="black", label="commanded"),
-        Line2D([], [], color=_MEASURED, label="measured"),
+        Line2D([], [], color=MEASURED, label="measured"),
         Line2D([], [], color="0.5", linestyle=":", label="bounds"),
     ]
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=8)
@@ -373,7 +358,7 @@ def _draw_contacts(axis: Any, r: Recording) -> None:
         axis.broken_barh([(a * r.dt, (b - a) * r.dt)], (-0.75, 0.55), color=GAIT_COLOURS[gait])
     for foot in range(len(FEET)):
         for flags, thick, colour in (
-            (r.desired[:, foot], 0.84, _DESIRED),
+            (r.desired[:, foot], 0.84, DESIRED),
             (r.contact[:, foot], 0.36, "black"),
         ):
             bars = [(a * r.dt, (b - a) * r.dt) for a, b in spans(flags)]
@@ -390,7 +375,7 @@ def _draw_command(
         axis.axhline(bound, color="0.5", linestyle=":", linewidth=1)
     seen = [command, bounds]
     if measured is not None:
-        axis.plot(ends, measured, color=_MEASURED, linewidth=0.9)
+        axis.plot(ends, measured, color=MEASURED, linewidth=0.9)
         seen.append(measured)
     # A command holds for the whole control step at whose end it was recorded.
     axis.stairs(command, np.append(0.0, ends), baseline=None, color="black", linewidth=1.2)

@@ -11,7 +11,6 @@ import glob
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,25 +52,6 @@ FIGURES = (
         "Tiles from above, one row per family, with the paths of some robots from start to goal.",
     ),
 )
-
-
-@dataclass(frozen=True)
-class Film:
-    """One filmed episode on the page.
-
-    Attributes:
-        row: of episodes.csv.
-        diagnosis: its row of diagnosis.csv, if any.
-        file: name of the film, None if there is no film.
-        uri: the film as a data URI, None if there is no film or no room for it on the page.
-        sheet: data URI, or None.
-    """
-
-    row: Row
-    diagnosis: Row | None
-    file: str | None
-    uri: str | None
-    sheet: str | None
 
 
 def data_uri(path: Path) -> str:
@@ -156,17 +136,7 @@ def _tuning(path: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     found = _json(path)
-    effect = [
-        {
-            "condition": condition,
-            "policies": {k: v for k, v in figures.items() if isinstance(v, dict)},
-            "tiles": min(f["n"] for f in figures.values() if isinstance(f, dict)),
-            "gained": figures["gained"],
-            "lost": figures["lost"],
-        }
-        for condition, figures in found["effect"].items()
-    ]
-    return {"changes": list(_flat(found["tuning"])), "effect": effect}
+    return {"changes": list(_flat(found["tuning"])), "effect": found["effect"]}
 
 
 def film_stem(row: Row) -> str:
@@ -176,19 +146,20 @@ def film_stem(row: Row) -> str:
     return EpisodeRecord(*where, level, episode, seed, row["outcome"]).name
 
 
-def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> Film:
-    """Collect an episode's files in ``folder``; a film is embedded if it fits in ``room`` bytes."""
+def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> dict[str, Any]:
+    """Describe an episode: its rows of episodes.csv and diagnosis.csv, the name of its film in
+    ``folder``, and film and sheet as data URIs; the film's only if it fits in ``room`` bytes."""
     stem = film_stem(row)
     kinds = (folder / f"film_{stem}.mp4", folder / f"film_{stem}.gif")
     path = next((path for path in kinds if path.is_file()), None)
     sheet = folder / f"sheet_{stem}.png"
-    return Film(
-        row,
-        diagnosis,
-        file=path.name if path else None,
-        uri=data_uri(path) if path and path.stat().st_size <= room else None,
-        sheet=data_uri(sheet) if sheet.is_file() else None,
-    )
+    return {
+        "row": row,
+        "diagnosis": diagnosis,
+        "file": path.name if path else None,
+        "uri": data_uri(path) if path and path.stat().st_size <= room else None,
+        "sheet": data_uri(sheet) if sheet.is_file() else None,
+    }
 
 
 def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> list[dict[str, Any]]:
@@ -210,8 +181,8 @@ def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> l
             if [row[key] for key in _TILE] == where:
                 film = _film(folder, row, causes.get(film_stem(row)), room)
                 films.append(film)
-                if film.file and film.uri:
-                    room -= (folder / film.file).stat().st_size
+                if film["uri"]:
+                    room -= (folder / film["file"]).stat().st_size
         suffix = "" if first["condition"] == "nominal" else f"_{first['condition']}"
         strip = folder / f"strip_{file_label(family)}_{first['level']}{suffix}.png"  # of episode 0
         shown = first["episode"] == "0" and strip.is_file()
