@@ -38,7 +38,7 @@ from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.parallel.worker import MakeLink, WorkerError
 from tdgc.policies import Policy
-from tdgc.policies.files import header_file
+from tdgc.policies.files import files_of
 from tdgc.policies.learning import MirroredHead
 from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
@@ -97,7 +97,7 @@ def pin_low(config: HighTrainConfig) -> HighTrainConfig:
     Raises:
         ConfigError: the low policy is not the one that the run began with.
     """
-    found = checksum(header_file(cast(str, config.low)))
+    found = checksum(files_of(cast(str, config.low))[0])
     if config.low_sha256 not in (None, found):
         raise ConfigError(f"{config.low} is not the low policy that this run began with")
     return dataclasses.replace(config, low_sha256=found)

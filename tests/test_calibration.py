@@ -127,6 +127,13 @@ def test_a_range_of_one_point_is_no_division_by_zero() -> None:
     assert np.isfinite(model(given)).all()
 
 
+@pytest.fixture
+def short_walk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "_WALK_SECONDS", 1.5)
+    monkeypatch.setattr(calibration, "_SETTLE_SECONDS", 0.7)
+
+
+@pytest.mark.usefixtures("short_walk")
 def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None:
     given, reached = measure(low, 24, seed=5)
     assert len(given) == len(reached) <= 24 and reached.shape[1] == 3
@@ -239,6 +246,7 @@ def test_a_robot_that_blows_up_does_not_end_the_lessons(
     task.close()
 
 
+@pytest.mark.usefixtures("short_walk")
 def test_script(
     low: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

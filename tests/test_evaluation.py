@@ -638,7 +638,7 @@ def test_a_condition_reaches_the_robots(name, friction, payload, delay, armature
     for body, client in zip(world._bodies, world._client_of, strict=True):
         mass, mu, *_ = client.getDynamicsInfo(body, -1)
         assert (mass, mu) == pytest.approx((world.state.geometry.trunk_mass + payload, friction))
-    assert world._armature.tolist() == [armature] * 2
+    assert world.armature.tolist() == [armature] * 2
     assert batch.loco.delay.tolist() == [delay] * 2
     assert world.strength[:, 0].tolist() == [motor] * 2
     world.close()

@@ -409,7 +409,8 @@ def test_rotor_inertia_is_about_the_joint_in_any_inertial_frame(tmp_path: Path) 
     for config in (RobotConfig(), turned):
         world = World(1, config, PhysicsConfig())
         world.reset_robots([0], np.array([[0.0, 0.0, 2.0]]), UPRIGHT, nominal_pose(config)[None])
-        world.set_dynamics([0], np.array([0.8]), np.zeros(1), np.array([0.02]))
+        world.armature[0] = 0.02
+        world.apply_dynamics([0])
         for _ in range(3):
             world.step(nominal_pose(config)[None, None] + 0.3, np.zeros(1), np.zeros((1, 12)))
         swung.append(world.state.q[0])
@@ -437,7 +438,8 @@ def test_leg_angles_of_another_robot(robot: RobotConfig) -> None:
 
 def test_payload_is_on_top_of_its_own_trunk(robot: RobotConfig) -> None:
     world = World(1, robot, PhysicsConfig())
-    world.set_dynamics([0], np.array([0.8]), np.array([2.1]), np.zeros(1))
+    world.payload[0] = 2.1
+    world.apply_dynamics([0])
     mass, _, inertia, *_ = world._client_of[0].getDynamicsInfo(world._bodies[0], -1)
     world.close()
     assert mass == pytest.approx(10.5)

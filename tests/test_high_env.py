@@ -691,14 +691,14 @@ def test_disturbances_widen_with_the_level():
     task = NavigationTask(CONFIG, LOW, 40, seed=3)
     task.curriculum.levels[:] = np.repeat([0, CONFIG.levels - 1], 20)
     task.reset(np.arange(40))
-    loco, speeds = task.locomotion, np.zeros(40)
-    for values in (loco.friction, loco.payload, loco.delay, loco.world.strength[:, 0]):
+    loco, world, speeds = task.locomotion, task.locomotion.world, np.zeros(40)
+    for values in (world.friction, world.payload, loco.delay, world.strength[:, 0]):
         assert np.ptp(values[:20]) == 0.0 and np.ptp(values[20:]) > 0.0
 
     def push(index, velocity):
         speeds[index] = np.abs(velocity).max(axis=1)
 
-    loco.world.push = push
+    world.push = push
     task._next_push[:] = 0
     task.step(np.zeros((40, 13)))
     assert (speeds[:20] == 0.0).all() and (speeds[20:] > 0.0).all()

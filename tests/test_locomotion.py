@@ -273,10 +273,10 @@ def draw_ten_times(
     loco: Locomotion, config: RandomisationConfig, rng: np.random.Generator
 ) -> list[Array]:
     """Draw ten times; return friction, payload, strength, latency and joint offset of each draw."""
-    draws = []
+    draws, world = [], loco.world
     for _ in range(10):
         loco.randomise(np.arange(loco.num_robots), config, rng)
-        values = (loco.friction, loco.payload, loco.world.strength, loco.delay, loco.joint_offset)
+        values = (world.friction, world.payload, world.strength, loco.delay, loco.joint_offset)
         draws.append([value.copy() for value in values])
     return [np.array(values) for values in zip(*draws, strict=True)]
 
@@ -291,11 +291,12 @@ def test_randomise_draws_within_bounds_and_tells_bullet() -> None:
         assert drawn.min() >= low and drawn.max() <= high
         assert drawn.min() < low + 0.1 * width and drawn.max() > high - 0.1 * width
     for i in (0, 10):  # one robot of each client
-        client, body = made.world._client_of[i], made.world._bodies[i]
+        world = made.world
+        client, body = world._client_of[i], world._bodies[i]
         trunk, calf = (client.getDynamicsInfo(body, link) for link in (-1, 2))
-        assert trunk[0] == pytest.approx(5.6 + made.payload[i], abs=1e-6)
-        assert trunk[1] == pytest.approx(made.friction[i], abs=1e-6)
-        assert calf[1] == pytest.approx(made.friction[i], abs=1e-6)
+        assert trunk[0] == pytest.approx(5.6 + world.payload[i], abs=1e-6)
+        assert trunk[1] == pytest.approx(world.friction[i], abs=1e-6)
+        assert calf[1] == pytest.approx(world.friction[i], abs=1e-6)
         assert calf[0] == pytest.approx(0.2, abs=1e-9)
     made.world.close()
 
@@ -305,11 +306,11 @@ def test_randomise_with_scale_zero_and_width_zero_is_nominal() -> None:
     rng = np.random.default_rng(0)
     made.randomise(np.array([1]), RandomisationConfig(scale=0.0), rng)
     made.randomise(np.array([2, 3]), RandomisationConfig(), rng, np.array([0.0, 1.0]))
-    assert made.friction[:3].tolist() == pytest.approx([0.8, 0.8, 0.8])
-    assert made.payload[:3].tolist() == made.delay[:3].tolist() == [0.0, 0.0, 0.0]
+    assert made.world.friction[:3].tolist() == pytest.approx([0.8, 0.8, 0.8])
+    assert made.world.payload[:3].tolist() == made.delay[:3].tolist() == [0.0, 0.0, 0.0]
     assert made.world.strength[:3, 0].tolist() == [1.0, 1.0, 1.0]
     assert (made.joint_offset[:3] == 0.0).all()
-    assert made.payload[3] != 0.0 and made.joint_offset[3].std() > 0.0
+    assert made.world.payload[3] != 0.0 and made.joint_offset[3].std() > 0.0
     made.world.close()
 
 
@@ -422,7 +423,7 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
         task.field.place(row, 0, tile)
     loco, state = task.locomotion, task.locomotion.world.state
     loco.world.upload_terrain()
-    loco.friction[:], loco.payload[:], loco.delay[:] = 0.6, 1.5, 0.012
+    loco.world.friction[:], loco.world.payload[:], loco.delay[:] = 0.6, 1.5, 0.012
     rng = np.random.default_rng(6)
     mirror_commands(loco, rng, gait=0)
     origin = task.field.origin(np.arange(2), 0)
@@ -508,7 +509,7 @@ def test_armature_and_joint_friction_are_drawn() -> None:
     made, config = standing(40), RandomisationConfig()
     made.randomise(np.arange(40), config, np.random.default_rng(0))
     for drawn, (low, high) in (
-        (made.armature, config.armature),
+        (made.world.armature, config.armature),
         (made.world.joint_friction[:, 0], config.joint_friction),
     ):
         width = high - low

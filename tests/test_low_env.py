@@ -147,9 +147,9 @@ def test_what_the_critic_sees_of_a_known_state() -> None:
     state.q[0] = [0.0, 0.7, -1.4] * 4
     state.derive()
     state.foot_force[0] = [0.0, 0.9, 1.1, 60.0]
-    loco.friction[:], loco.payload[:], loco.delay[:] = 0.5, 1.5, 0.015
+    loco.world.friction[:], loco.world.payload[:], loco.delay[:] = 0.5, 1.5, 0.015
     loco.world.strength[:] = 0.9
-    loco.armature[:], loco.world.joint_friction[:] = 0.012, 0.1
+    loco.world.armature[:], loco.world.joint_friction[:] = 0.012, 0.1
     task.ground = measure_ground(task.locomotion)
     seen = critic(task)
     np.testing.assert_allclose(seen["velocity"], [[1.2, 0.4, 0.2]], atol=1e-6)
@@ -1062,8 +1062,8 @@ def test_tilts_are_remembered_step_by_step() -> None:
 @pytest.mark.parametrize("training", [False, True])
 def test_robots_are_randomised_in_training(training: bool) -> None:
     task = begin(PLANE, 8, training)
-    loco = task.locomotion
-    for drawn in (loco.friction, loco.payload, loco.delay, loco.world.strength):
+    loco, world = task.locomotion, task.locomotion.world
+    for drawn in (world.friction, world.payload, loco.delay, world.strength):
         assert (np.ptp(drawn) > 0.0) == training
     task.close()
 

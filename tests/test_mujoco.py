@@ -117,8 +117,8 @@ def test_it_stands_on_its_feet() -> None:
     assert np.abs(state.torque).max() == pytest.approx(
         20.0 * np.abs(state.q - nominal_pose(ROBOT)).max(), rel=0.05
     )
-    one = np.ones(1)
-    world.set_dynamics(np.arange(1), 0.8 * one, 3.0 * one, 0.0 * one)
+    world.payload[0] = 3.0
+    world.apply_dynamics([0])
     hold(world, 2.0)
     assert world.state.foot_force.sum() == pytest.approx(WEIGHT + 3.0 * 9.81, rel=0.01)
 

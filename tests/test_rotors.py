@@ -53,7 +53,8 @@ def bullet(
     physics: PhysicsConfig, armature: float, payload: float = 0.0, robot: RobotConfig = ROBOT
 ) -> World:
     world = World(1, robot, physics)
-    world.set_dynamics([0], np.array([0.8]), np.array([payload]), np.array([armature]))
+    world.payload[0], world.armature[0] = payload, armature
+    world.apply_dynamics([0])
     return world
 
 
@@ -111,7 +112,8 @@ def test_inertia_is_added_to_a_joints_link_and_its_parent() -> None:
 
     before = inertia()
     for armature in (0.02, ROTOR):
-        world.set_dynamics([0], np.array([0.8]), np.zeros(1), np.array([armature]))
+        world.armature[0] = armature
+        world.apply_dynamics([0])
     leg = [[1.0, 1.0, 0.0], [0.0, 2.0, 0.0], [0.0, 1.0, 0.0]]
     expected = ROTOR * np.array([[4.0, 0.0, 0.0], *4 * leg])
     np.testing.assert_allclose(inertia() - before, expected, atol=1e-9)
@@ -119,7 +121,8 @@ def test_inertia_is_added_to_a_joints_link_and_its_parent() -> None:
     targets = np.tile(NOMINAL + 0.2, (3, 1, 1))
     world.step(targets, np.zeros(1), np.zeros((1, 12)))
     assert np.abs(world.state.rotor_excess).max() > 0.1
-    world.set_dynamics([0], np.array([0.8]), np.zeros(1), np.zeros(1))
+    world.armature[0] = 0.0
+    world.apply_dynamics([0])
     world.step(targets, np.zeros(1), np.zeros((1, 12)))
     np.testing.assert_allclose(inertia(), before, atol=1e-9)
     assert not world.state.rotor_excess.any()

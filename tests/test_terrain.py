@@ -214,7 +214,7 @@ def test_pillar_count_and_height(difficulty, count):
 
 def test_pillars_keep_clear_and_inside():
     for seed in range(40):
-        x, y, d = terrain.place(
+        x, y, d = terrain.draw_cylinders(
             terrain.WHOLE_ZONE, 28, terrain.PILLAR_DIAMETER, np.random.default_rng(seed)
         ).T
         assert len(x) == 28
@@ -228,7 +228,7 @@ def test_pillars_keep_clear_and_inside():
 def test_pillars_that_cannot_fit_raise():
     narrow = terrain.Section(1.5, 1.5, 2.0, 2.0)
     with pytest.raises(RuntimeError, match=r"no room for 28 cylinders"):
-        terrain.place(narrow, 28, terrain.PILLAR_DIAMETER, np.random.default_rng(0))
+        terrain.draw_cylinders(narrow, 28, terrain.PILLAR_DIAMETER, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(("difficulty", "step"), [(0, 0.02), (0.5, 0.085), (1, 0.15)])

@@ -265,7 +265,8 @@ def test_a_standing_robot_presses_with_its_weight(plane: World) -> None:
 
 @pytest.mark.parametrize("payload", [-1.0, 3.0])
 def test_payload_adds_its_weight(plane: World, payload: float) -> None:
-    plane.set_dynamics([0], np.array([0.8]), np.array([payload]), np.zeros(1))
+    plane.payload[0] = payload
+    plane.apply_dynamics([0])
     hold(plane, 100)
     assert mean_foot_force(plane)[0].sum() == pytest.approx((MASS + payload) * G, rel=0.01)
     mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
@@ -273,7 +274,8 @@ def test_payload_adds_its_weight(plane: World, payload: float) -> None:
     nominal = np.array([0.016147, 0.068159, 0.073013])
     np.testing.assert_allclose(inertia, nominal * mass / GEOMETRY.trunk_mass, rtol=1e-6)
     # A new payload replaces the last one instead of adding to it.
-    plane.set_dynamics([0], np.array([0.8]), np.array([0.0]), np.zeros(1))
+    plane.payload[0] = 0.0
+    plane.apply_dynamics([0])
     mass, _, inertia, *_ = plane._client_of[0].getDynamicsInfo(plane._bodies[0], -1)
     assert mass == pytest.approx(GEOMETRY.trunk_mass)
     np.testing.assert_allclose(inertia, nominal, rtol=1e-6)
@@ -317,7 +319,8 @@ def test_joint_friction_holds_a_joint_back(plane: World) -> None:
 @pytest.mark.parametrize("friction", [0.4, 0.8])
 def test_friction_slows_a_sliding_robot(plane: World, friction: float) -> None:
     """Lying on its back and pushed at 1 m/s, the robot loses speed at a rate of mu g."""
-    plane.set_dynamics([0], np.array([friction]), np.array([0.0]), np.zeros(1))
+    plane.friction[0] = friction
+    plane.apply_dynamics([0])
     plane.reset_robots([0], np.array([[0.0, 0.0, 0.056]]), UPSIDE_DOWN, NOMINAL[None])
     hold(plane, 15)
     assert np.linalg.norm(plane.state.lin_vel[0]) < 0.05
@@ -551,6 +554,11 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
     """Robots that stumble in two clients move alike to the last bit, but not without ``forget``."""
     m = 1 + (CLIENT_ROBOTS if terrain else PLANE_CLIENT_ROBOTS)
     rng = np.random.default_rng(0)
+
+    def disturb(world: World) -> None:
+        world.friction[:], world.payload[:], world.armature[:] = 0.6, 2.0, 0.01
+        world.apply_dynamics(np.arange(m))
+
     field = tiles((["rough", "stair", "gap"] * m)[:m], level=6) if terrain else None
     world = World(m, ROBOT, PHYSICS, field)
     xy = np.column_stack([np.arange(m), np.zeros(m)])
@@ -559,7 +567,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
     ground = world.ground_height(xy[:, 0], xy[:, 1])
     pose, upright = np.tile(NOMINAL, (m, 1)), yaw_quaternion(rng.uniform(-3, 3, m))
     world.reset_robots(np.arange(m), np.column_stack([xy, ground + STAND + 0.1]), upright, pose)
-    world.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0), np.full(m, 0.01))
+    disturb(world)
 
     def stumble(worlds: list[World], steps: int) -> bool:
         """Step all worlds with the same random targets; return whether they stay identical."""
@@ -573,7 +581,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
 
     def anew() -> World:
         other = World(m, ROBOT, PHYSICS, field)
-        other.set_dynamics(np.arange(m), np.full(m, 0.6), np.full(m, 2.0), np.full(m, 0.01))
+        disturb(other)
         for name in ("position", "quaternion", "lin_vel", "ang_vel", "q", "qd", "rotor_excess"):
             getattr(other.state, name)[:] = getattr(world.state, name)
         other.state.derive()

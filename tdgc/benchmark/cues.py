@@ -18,7 +18,15 @@ from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import GOAL_X, ZONE
 from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
-from tdgc.tasks.leaps import BEYOND, Landing, LeapPlan, Motion, leap_command, steer_leap
+from tdgc.tasks.leaps import (
+    BEYOND,
+    STRIDE_COMMANDS,
+    Landing,
+    LeapPlan,
+    Motion,
+    leap_command,
+    steer_leap,
+)
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.teacher import CAREFUL, LEAPING, SLOPING, Skill, Style, toward
 
@@ -200,7 +208,7 @@ class CuesLaw:
             phase = np.arctan2(cue["clock"][rows, 1], cue["clock_cosine"][rows, 1])
             clock = raw_phase(np.mod(phase / (2.0 * np.pi), 1.0), before[rows, INDEX["duration"]])
             commanded = np.full(len(rows), min(self._leap_speed, self._ranges.vx[1]))
-            stride = before[rows][:, [INDEX["frequency"], INDEX["stance_length"]]].T
+            stride = before[rows][:, STRIDE_COMMANDS].T
             motion = Motion(x[rows], speed[rows], commanded, clock, *stride)
             leap_command(leaps, *memory.plan.steps(rows, motion, landing))
             memory.command[rows] = leaps

@@ -23,7 +23,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import width
 from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.sensors import Noise
-from tdgc.tasks.high_observation import SEMANTIC, HighObserver, high_layout
+from tdgc.tasks.high_observation import SEMANTIC, HighObserver, high_layout, semantic_index
 from tdgc.tasks.pairing import paired
 from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.teacher import Skill, Teacher, toward
@@ -162,7 +162,7 @@ class HierarchyDriver(Driver):
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         m, config = loco.num_robots, self.config
         self._loco, self._goal = loco, goal
-        seen = SEMANTIC.index(family if family in SEMANTIC else "unknown")
+        seen = semantic_index(family)
         self._families = np.full(m, seen)
         if config.cues in ("both", "semantic"):
             self.told = SEMANTIC[seen]

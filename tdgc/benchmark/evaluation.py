@@ -272,11 +272,11 @@ class Batch:
             world, physics = make_world(self.field), config.physics
         loco = Locomotion(cell.count, config.robot, physics, self.field, config.gyro, world=world)
         self.loco, self.origin = loco, self.field.origin(rows, 0)
-        loco.friction[:] = physics.friction if condition.friction is None else condition.friction
-        loco.payload[:], loco.delay[:] = condition.payload, condition.latency
-        loco.armature[:] = condition.armature
-        loco.world.strength[:] = condition.motor
-        loco.apply_dynamics(rows)
+        world, loco.delay[:] = loco.world, condition.latency
+        world.friction[:] = physics.friction if condition.friction is None else condition.friction
+        world.payload[:], world.armature[:] = condition.payload, condition.armature
+        world.strength[:] = condition.motor
+        world.apply_dynamics(rows)
         start, self.goal = self.field.starts[:, 0], self.field.goals[:, 0] + self.origin
         loco.place(rows, start[:, :2] + self.origin, start[:, 2], clock)
         self._push_every = round(PUSH_INTERVAL / physics.control_dt)

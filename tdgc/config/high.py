@@ -1,7 +1,7 @@
 """The decision-level MDP (paper Sec. IV-B) and its curriculum (Sec. IV-C)."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from tdgc.config.settings import Count, NotNegative, Positive, Share, Whole
 from tdgc.config.sim import CommandRanges, RandomisationConfig
@@ -41,7 +41,8 @@ class HighRewardConfig:
     lazy_speed: float = 0.1  # m/s, v_th
 
 
-_GAITS: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = ("trot", "pronk", "pace", "bound")
+Gait = Literal["trot", "pronk", "pace", "bound"]
+_GAITS: tuple[Gait, ...] = get_args(Gait)
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,7 @@ class HighLevelConfig:
     decimation: Count = 5  # control steps per decision: 10 Hz; 1 is the paper's synchronous loop
     cues: Literal["both", "semantic", "geometric", "none"] = "both"
     # Gaits that the gait channel chooses from; each takes an equal share of the channel's range.
-    gaits: tuple[Literal["trot", "pronk", "pace", "bound"], ...] = field(
-        default=_GAITS, metadata={"before": _GAITS}
-    )
+    gaits: tuple[Gait, ...] = field(default=_GAITS, metadata={"before": _GAITS})
     # What the high policy decides: all commands, or only the velocities and the gait. The remaining
     # commands then stay at their defaults, or at the nearest value that ``commands`` allows.
     behaviour: Literal["all", "velocities"] = field(default="all", metadata={"before": "all"})

@@ -132,8 +132,8 @@ class LowLevelConfig:
     robot: RobotConfig = field(default_factory=RobotConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     commands: CommandRanges = field(default_factory=CommandRanges)
-    # These two were constants in the code before they became settings. If one of their defaults
-    # changes, its previous value must be recorded here.
+    # Configurations stored with the first policies lack these two; ``before`` is what applied to
+    # them. If one of the defaults changes, its previous value must be recorded here.
     command_draw: CommandDrawConfig = field(
         default_factory=CommandDrawConfig,
         metadata={"before": dataclasses.asdict(CommandDrawConfig(retries=0.0))},

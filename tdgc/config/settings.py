@@ -49,7 +49,7 @@ Config = TypeVar("Config")
 
 def to_dict(config: Any) -> dict[str, Any]:
     """Convert a configuration to nested plain dicts, ready for JSON (tuples become lists)."""
-    return typing.cast(dict[str, Any], json.loads(json.dumps(dataclasses.asdict(config))))
+    return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
 def read_json(path: Path) -> Any:
@@ -215,11 +215,10 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
         if len(value) != len(args):
             raise ConfigError(f"'{path}' must have {len(args)} values, not {len(value)}")
         return tuple(_coerce(a, v, path) for a, v in zip(args, value, strict=True))
-    if hint is bool and isinstance(value, bool):
+    truth = isinstance(value, bool)  # which counts as an int in Python
+    if hint in (bool, int, str) and isinstance(value, hint) and truth == (hint is bool):
         return value
-    if hint is int and isinstance(value, int) and not isinstance(value, bool):
-        return value
-    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+    if hint is float and isinstance(value, (int, float)) and not truth:
         try:
             number = float(value)
         except OverflowError:  # an integer beyond the largest float
@@ -227,7 +226,5 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
         if not math.isfinite(number):
             raise ConfigError(f"'{path}' must be a finite number, not {shown}")
         return number
-    if hint is str and isinstance(value, str):
-        return value
     kind = getattr(hint, "__name__", str(hint))
     raise ConfigError(f"'{path}' must be of type {kind}, not {shown}")

@@ -27,12 +27,11 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from torch import nn
 
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, WholeEnvBuffer
-from tdgc.sim.commands import INDEX, NUM_ACTIONS
+from tdgc.sim.commands import NUM_ACTIONS
 from tdgc.tasks.high_observation import GUIDANCE, GUIDANCE_PARTS
-from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
+from tdgc.tasks.leaps import FREQUENCIES, LENGTHS, STRIDE_COMMANDS
 from tdgc.tasks.teacher import WAY
 
-_STRIDE = [INDEX["frequency"], INDEX["stance_length"]]
 # Weights, as in the comparisons of docs/experiments.md: of a stride's price against a squared error
 # in the action; of the squared error of a stride that has a price; and of a decision whose stride
 # has a price against other decisions. An error in such a decision leads into a trench, whereas most
@@ -63,7 +62,7 @@ class TaughtPolicy(FastRecurrentPolicy):
 
     def error(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
         """``imitation_loss`` of the mean actions ``mean`` (n, 13) at observations ``obs``, (n,)."""
-        limit = float(cast(spaces.Box, self.action_space).high[_STRIDE[0]])
+        limit = float(cast(spaces.Box, self.action_space).high[STRIDE_COMMANDS[0]])
         return imitation_loss(mean, obs[..., self.seen :], limit)
 
     def bonus(self, obs: th.Tensor, mean: th.Tensor) -> th.Tensor:
@@ -113,10 +112,10 @@ def imitation_loss(mean: th.Tensor, guidance: th.Tensor, limit: float) -> th.Ten
     taught, aside, dearer, price = th.split(guidance, list(GUIDANCE_PARTS.values()), dim=1)
     error = (mean - taught).square()
     weight, priced = th.ones_like(error), price.amax(1) > 0.0
-    weight[:, _STRIDE] = th.where(priced, _PRICED, 1.0)[:, None]
+    weight[:, STRIDE_COMMANDS] = th.where(priced, _PRICED, 1.0)[:, None]
     other = (mean[:, WAY] - taught[:, WAY] - aside).square().sum(1) + _DEARER * dearer[:, 0]
     saved = (error[:, WAY].sum(1) - other).clamp(min=0.0)  # by taking the second way around
-    cost = expected_price(mean[:, _STRIDE], price.view(-1, FREQUENCIES, LENGTHS), limit)
+    cost = expected_price(mean[:, STRIDE_COMMANDS], price.view(-1, FREQUENCIES, LENGTHS), limit)
     loss = ((weight * error).sum(1) - saved + _PRICE_WEIGHT * cost) / NUM_ACTIONS
     return th.where(priced, _LEAP_WEIGHT, 1.0) * loss
 

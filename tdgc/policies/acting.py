@@ -80,7 +80,8 @@ class Policy:
         low, high: bounds of the actions, (action_dim,), in the environment's action units.
         tensors: all weights by name in the file, including the critic's.
         actor: the actor's MLP, without LSTM and encoder.
-        state_size: width of h and of c, 0 for "mlp"; with a mirror twice the LSTM's size.
+        state_size: width of h and of c, 0 for "mlp"; with a mirror twice the LSTM's size: first the
+            observed side, then its mirror image.
     """
 
     def __init__(self, header: Header, tensors: dict[str, th.Tensor]) -> None:
@@ -121,8 +122,8 @@ class Policy:
         Args:
             obs: (n, d) or (d,), where d is ``actor_dim`` or ``obs_dim``; of the latter only the
                 actor part is used.
-            state: (h, c), each (1, n, hidden), as returned before; None for zeros. For "mlp" it
-                is returned unchanged. With a mirror ``hidden`` is twice the LSTM's size.
+            state: (h, c), each (1, n, state_size), as returned before; None for zeros. For "mlp"
+                it is returned unchanged.
             episode_start: (n,) or a scalar, true where the state is to be zeroed first.
             deterministic: return the mean action; otherwise sample from the Gaussian.
 
@@ -158,12 +159,9 @@ class Policy:
     ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
         """Run one step of the encoder, if any, and the LSTM.
 
-        With a mirror ``hidden`` is twice the LSTM's size: first the observed side, then its mirror
-        image.
-
         Args:
             x: (n, inputs).
-            state: h and c, each (n, hidden).
+            state: h and c, each (n, state_size).
 
         Returns:
             Latents for the actor, (n, latent), with a mirror (2n, latent); and the new h and c.

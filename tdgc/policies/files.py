@@ -340,28 +340,19 @@ def store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Te
     if len(text) > _MAX_JSON_BYTES:
         raise ValueError(f"meta takes {len(text)} bytes, more than {_MAX_JSON_BYTES}")
     Header.from_json(text.decode())  # write nothing that cannot be read back
-    stem = _stem(path)
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    _write(_with_suffix(stem, ".safetensors"), weights)
-    _write(_with_suffix(stem, ".json"), text)
+    header_path, weights_path = files_of(path)
+    header_path.parent.mkdir(parents=True, exist_ok=True)
+    _write(weights_path, weights)
+    _write(header_path, text)
 
 
-def header_file(path: str | os.PathLike[str]) -> Path:
-    """The ``NAME.json`` of a policy, named with or without a suffix.
-
-    It contains the checksum of the weights.
-    """
-    return _with_suffix(_stem(path), ".json")
-
-
-def _stem(path: str | os.PathLike[str]) -> Path:
+def files_of(path: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """The files of a policy named with or without a suffix: ``NAME.json``, which contains the
+    checksum of the other one, and ``NAME.safetensors``."""
     path = Path(path)
-    return path.with_suffix("") if path.suffix in (".safetensors", ".json") else path
-
-
-def _with_suffix(stem: Path, suffix: str) -> Path:
+    name = path.stem if path.suffix in (".safetensors", ".json") else path.name
     # Not Path.with_suffix, which would drop the ".5" of "low-v1.5".
-    return stem.parent / (stem.name + suffix)
+    return path.parent / f"{name}.json", path.parent / f"{name}.safetensors"
 
 
 def _write(path: Path, data: bytes) -> None:
@@ -394,8 +385,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
         PolicyFileError: a file is missing, damaged, too large or does not match the other one; the
             message names it.
     """
-    stem = _stem(path)
-    header_path, weights_path = _with_suffix(stem, ".json"), _with_suffix(stem, ".safetensors")
+    header_path, weights_path = files_of(path)
     try:
         text = _read_bytes(header_path, _MAX_JSON_BYTES).decode()
     except UnicodeDecodeError:

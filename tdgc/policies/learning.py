@@ -65,7 +65,7 @@ class AsymmetricMlpExtractor(nn.Module):
 
     def _latent(self, net: nn.Module, x: th.Tensor) -> th.Tensor:
         if not self.mirrored:
-            return cast(th.Tensor, net(x))
+            return net(x)
         width = x.shape[-1]
         index, sign = cast(th.Tensor, self.index), cast(th.Tensor, self.sign)
         both = net(th.cat([x, x[..., index[:width]] * sign[:width]]))
@@ -91,7 +91,7 @@ class MirroredHead(nn.Module):
         """(n, 2 latent_dim) -> (n, outputs)."""
         index, sign = cast(th.Tensor, self.index), cast(th.Tensor, self.sign)
         seen, mirrored = (self.linear(x) for x in latents.chunk(2, dim=-1))
-        return cast(th.Tensor, 0.5 * (seen + mirrored[..., index] * sign))
+        return 0.5 * (seen + mirrored[..., index] * sign)
 
 
 class NoMemory(nn.Module):

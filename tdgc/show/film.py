@@ -93,14 +93,6 @@ def ground_picture(tile: Tile, way: Array | None = None, colour: str = "black") 
     return image
 
 
-def field_of(tile: Tile) -> TileField:
-    """Make a field of this one tile, which cannot be changed."""
-    field = TileField((1, 1))
-    field.place(0, 0, tile)
-    field.heights.setflags(write=False)  # makes the world faster
-    return field
-
-
 def set_stage(
     tile: Tile,
     robot: RobotConfig,
@@ -113,7 +105,7 @@ def set_stage(
     Raises:
         WindowError: ``window`` without a display.
     """
-    stage = Stage(robot, PhysicsConfig(), field_of(tile), window)
+    stage = Stage(robot, PhysicsConfig(), TileField.of(tile), window)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "ground.png")
         ground_picture(tile, way, colour).save(path)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import CONDITIONS, Batch, Cell, physics_of, run_cell, tile_of
 from tdgc.policies import Policy
-from tdgc.show.film import field_of, set_stage
+from tdgc.show.film import set_stage
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, CommandDecoder, default_command, gait_index
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
@@ -81,7 +81,7 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
         WindowError: the window cannot be opened.
     """
     config, tile = load_low(low)[1], tile_of(seed, cell.family, cell.level, cell.first)
-    stage, field = set_stage(tile, config.robot, window=True), field_of(tile)
+    stage, field = set_stage(tile, config.robot, window=True), TileField.of(tile)
     physics = physics_of(config, CONDITIONS["nominal"])
     loco = Locomotion(1, config.robot, physics, field, config.gyro)
     executor = Executor(loco, low)

@@ -68,7 +68,7 @@ _OBSERVATION_ZERO: NDArray[np.float64] = np.concatenate([default_command()[:12],
 
 def observed_command(command: NDArray[np.floating]) -> NDArray[np.float64]:
     """Normalise commands (..., 15) as the low policy's network sees them."""
-    return np.asarray((command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT)
+    return (command - _OBSERVATION_ZERO) / _OBSERVATION_UNIT
 
 
 def command_bounds(ranges: CommandRanges) -> NDArray[np.float64]:

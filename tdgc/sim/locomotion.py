@@ -43,7 +43,7 @@ from tdgc.sim.world import World
 from tdgc.state import State, copies, fill
 
 SPEED_SCALE = 0.05  # s/rad, scale of joint speeds in the observation (Walk These Ways)
-GYRO_SCALE = 0.25  # s/rad, scale of angular velocity in the observation
+GYRO_SCALE = 0.25  # s/rad, scale of angular velocity in the observation (Walk These Ways)
 _FREQUENCY = INDEX["frequency"]
 _LATENCY = 0.04  # s, the longest: real robots have about 0.03
 
@@ -61,14 +61,13 @@ def check_randomisation(
     Raises:
         ConfigError: a range outside what is allowed; the message names the limits.
     """
-    any_more = float("inf")
     allowed = {  # nominal, least and greatest value
-        "friction": (physics.friction, 0.0, any_more),
-        "payload": (0.0, -0.9 * trunk_mass, any_more),  # leave some mass for Bullet
-        "motor_strength": (1.0, 0.0, any_more),
+        "friction": (physics.friction, 0.0, np.inf),
+        "payload": (0.0, -0.9 * trunk_mass, np.inf),  # leave some mass for Bullet
+        "motor_strength": (1.0, 0.0, np.inf),
         "latency": (0.0, 0.0, _LATENCY),
-        "armature": (0.0, 0.0, any_more),
-        "joint_friction": (0.0, 0.0, any_more),
+        "armature": (0.0, 0.0, np.inf),
+        "joint_friction": (0.0, 0.0, np.inf),
     }
     for name, (nominal, least, greatest) in allowed.items():
         low, high = (nominal + config.scale * (b - nominal) for b in getattr(config, name))
@@ -109,9 +108,6 @@ class Locomotion:
         layout: terms of the observation.
         delay: (M,) s, latency.
         joint_offset: (M, 12) rad, error of each joint's zero.
-        friction: (M,), coefficient of friction.
-        payload: (M,) kg on the trunk.
-        armature: (M,) kg m^2, rotor inertia of each joint.
     """
 
     def __init__(
@@ -140,9 +136,6 @@ class Locomotion:
         self.targets = np.tile(self.nominal, (kept, num_robots, 1))
         self.delay = np.zeros(num_robots)
         self.joint_offset = np.zeros((num_robots, NUM_JOINTS))
-        self.friction = np.full(num_robots, physics.friction)
-        self.payload = np.zeros(num_robots)
-        self.armature = np.zeros(num_robots)
         geometry = self.world.state.geometry
         self._feet = nominal_feet(robot, geometry)
         self._stand = nominal_height(robot, geometry)
@@ -224,28 +217,22 @@ class Locomotion:
         Raises:
             ConfigError: see ``check_randomisation``.
         """
-        n = len(index)
-        check_randomisation(config, self.physics, self.world.state.geometry.trunk_mass)
+        n, world = len(index), self.world
+        check_randomisation(config, self.physics, world.state.geometry.trunk_mass)
         scale = np.broadcast_to(config.scale * np.asarray(width), n)
 
         def draw(bounds: Range, nominal: float, shape: tuple[int, ...] = (n,)) -> Array:
             drawn = rng.uniform(*bounds, size=shape) - nominal
             return nominal + (scale * drawn.T).T
 
-        self.friction[index] = draw(config.friction, self.physics.friction)
-        self.payload[index] = draw(config.payload, 0.0)
-        self.world.strength[index, 0] = draw(config.motor_strength, 1.0)
+        world.friction[index] = draw(config.friction, self.physics.friction)
+        world.payload[index] = draw(config.payload, 0.0)
+        world.strength[index, 0] = draw(config.motor_strength, 1.0)
         self.joint_offset[index] = draw(config.joint_offset, 0.0, (n, NUM_JOINTS))
         self.delay[index] = draw(config.latency, 0.0)
-        self.armature[index] = draw(config.armature, 0.0)
-        self.world.joint_friction[index, 0] = draw(config.joint_friction, 0.0)
-        self.apply_dynamics(index)
-
-    def apply_dynamics(self, index: NDArray[np.integer]) -> None:
-        """Set friction, payload and armature of the robots ``index`` in the world."""
-        self.world.set_dynamics(
-            index, self.friction[index], self.payload[index], self.armature[index]
-        )
+        world.armature[index] = draw(config.armature, 0.0)
+        world.joint_friction[index, 0] = draw(config.joint_friction, 0.0)
+        world.apply_dynamics(index)
 
     def act(self, actions: NDArray[np.floating]) -> None:
         """Run one control step: clip, scale, delay, PD control, clock (Sec. IV-A).
@@ -275,7 +262,8 @@ class Locomotion:
 
     def _arrays(self) -> dict[str, Array]:
         """Everything that a step passes on to the next, except Bullet's memory of contacts."""
-        fields = dataclasses.fields(self.world.state)
+        world = self.world
+        fields = dataclasses.fields(world.state)
         measured = [f.name for f in fields if f.init and f.name != "geometry"]
         return {
             "command": self.command,
@@ -286,12 +274,12 @@ class Locomotion:
             "gait": self.clock.embedding,
             "delay": self.delay,
             "joint_offset": self.joint_offset,
-            "friction": self.friction,
-            "payload": self.payload,
-            "armature": self.armature,
-            "strength": self.world.strength,
-            "joint_friction": self.world.joint_friction,
-            **{name: getattr(self.world.state, name) for name in measured},
+            "friction": world.friction,
+            "payload": world.payload,
+            "armature": world.armature,
+            "strength": world.strength,
+            "joint_friction": world.joint_friction,
+            **{name: getattr(world.state, name) for name in measured},
         }
 
     def state_dict(self) -> State:
@@ -307,7 +295,7 @@ class Locomotion:
         fill(self._arrays(), state)
         self.world.state.derive()
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
-        self.apply_dynamics(np.arange(self.num_robots))
+        self.world.apply_dynamics(np.arange(self.num_robots))
         self.world.forget()
 
     def observe(self, noise: Noise | None = None) -> NDArray[np.float32]:

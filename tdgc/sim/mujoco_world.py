@@ -70,8 +70,9 @@ class MujocoConfig:
 class MujocoWorld(World):
     """One robot on the only tile of a field, simulated by MuJoCo instead of Bullet.
 
-    It supports what an episode needs of a ``World``, but not changing the terrain, ``forget`` and
-    ``picture``.
+    It supports what an episode needs of a ``World``, but not changing the terrain, ``forget``,
+    ``picture`` and ``joint_friction``: dry friction is that of the settings. ``armature`` is added
+    to that of the settings.
 
     Args:
         robot: its URDF, gains and limits.
@@ -93,7 +94,8 @@ class MujocoWorld(World):
         visual: bool = False,
     ) -> None:
         self.num_robots, self.robot, self.physics, self.field = 1, robot, physics, field
-        self.strength, self._active = np.ones((1, 1)), np.arange(1)
+        self._make_dynamics()
+        self._active = np.arange(1)
         self.state = RobotState.zeros(read_geometry(robot), 1)
         self.model = _build(robot, field, config, visual)
         self.data = mujoco.MjData(self.model)
@@ -134,15 +136,14 @@ class MujocoWorld(World):
         turn = rotation_matrix(state.quaternion)[i].T
         velocity[:3], velocity[3:6] = state.lin_vel[i], turn @ state.ang_vel[i]
 
-    def set_dynamics(
-        self, index: ArrayLike, friction: Array, payload: Array, armature: Array
-    ) -> None:
-        """As ``World.set_dynamics``; ``armature`` (1,) kg m^2 is added to that of the settings."""
+    def apply_dynamics(self, index: ArrayLike) -> None:
+        """Pass on changes of ``friction``, ``payload`` and ``armature`` to MuJoCo."""
         model, (mass, inertia) = self.model, self._trunk
-        share = (mass + payload) / mass  # the payload is spread over the trunk: inertia scales too
+        # The payload is spread over the trunk, so the inertia scales with the mass.
+        share = (mass + self.payload) / mass
         model.body(1).mass, model.body(1).inertia = share * mass, share * inertia
-        model.geom_friction[:, 0] = friction[0]  # MuJoCo takes the larger of two in contact
-        model.dof_armature[self._qd] = self._rotor + armature
+        model.geom_friction[:, 0] = self.friction[0]  # MuJoCo takes the larger of two in contact
+        model.dof_armature[self._qd] = self._rotor + self.armature
         mujoco.mj_setConst(model, mujoco.MjData(model))  # on scratch data, as it moves the robot
 
     def retire(self, index: ArrayLike) -> None:

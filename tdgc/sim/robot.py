@@ -131,7 +131,7 @@ def foot_travel(command: Array, phases: Array, rest: Array) -> Array:
     ground_x = command[:, INDEX["vx"], None] - turn * rest[..., 1]
     ground_y = command[:, INDEX["vy"], None] + turn * rest[..., 0]
     travel = np.stack([ground_x, ground_y], axis=-1) * stance_time[:, None, None]
-    return np.asarray(lead[..., None] * travel)
+    return lead[..., None] * travel
 
 
 def walking_pose(
@@ -182,7 +182,7 @@ def stance_load(geometry: Geometry, command: Array, phases: Array) -> Array:
     """
     weight = GRAVITY * sum(geometry.masses.values())
     peak = 0.5 * np.pi * weight / (4.0 * command[:, INDEX["duration"], None])
-    return np.asarray(peak * np.maximum(np.sin(2.0 * np.pi * phases), 0.0))
+    return peak * np.maximum(np.sin(2.0 * np.pi * phases), 0.0)
 
 
 def load_torque(geometry: Geometry, q: Array, load: Array) -> Array:
@@ -385,13 +385,10 @@ class RobotState:
     def zeros(cls, geometry: Geometry, num_robots: int) -> "RobotState":
         """A state of ``num_robots`` upright robots at the origin."""
         m = num_robots
-        quaternion = np.zeros((m, 4))
-        quaternion[:, 3] = 1.0
-        arrays = [np.zeros((m, n)) for n in (3, 3, 12, 12, 12, 4, 4)]
-        lin, ang, q, qd, torque, foot, leg = arrays
-        trunk = np.zeros((m, 3)), quaternion, lin, ang
-        forces = foot, leg, np.zeros(m)
-        state = cls(geometry, *trunk, q, qd, torque, *forces, np.zeros((m, NUM_JOINTS + 3)))
+        rows = [(m, n) for n in (3, 4, 3, 3, 12, 12, 12, 4, 4)]  # of the fields up to ``leg_force``
+        shapes = [*rows, (m,), (m, NUM_JOINTS + 3)]
+        state = cls(geometry, *(np.zeros(shape) for shape in shapes))
+        state.quaternion[:, 3] = 1.0
         state.derive()
         return state
 
@@ -403,12 +400,12 @@ class RobotState:
     @property
     def touching(self) -> NDArray[np.bool_]:
         """Whether each foot is in contact, (M, 4)."""
-        return np.asarray(self.foot_force > CONTACT_FORCE)
+        return self.foot_force > CONTACT_FORCE
 
     @property
     def power(self) -> Array:
         """Sum of the absolute mechanical power of the joints, (M,) W: braking recovers nothing."""
-        return np.asarray(np.abs(self.torque * self.qd).sum(axis=1))
+        return np.abs(self.torque * self.qd).sum(axis=1)
 
     def derive(self) -> None:
         """Compute the fields that follow from the simulated ones.

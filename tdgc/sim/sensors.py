@@ -2,18 +2,11 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from tdgc.config import RandomisationConfig
 from tdgc.sim.robot import Array
-
-
-class Draws(Protocol):
-    """The source of sensor errors: ``np.random.Generator`` or ``EpisodeDraws``."""
-
-    def uniform(self, low: float, high: float, size: tuple[int, ...]) -> Array: ...
 
 
 class EpisodeDraws:
@@ -38,9 +31,9 @@ class Noise:
     """Sensor errors: their widths, and the source they are drawn from."""
 
     config: RandomisationConfig
-    draws: Draws
+    draws: np.random.Generator | EpisodeDraws
 
     def draw(self, width: float, shape: tuple[int, ...]) -> Array:
         """Draw errors of shape ``shape``, (M, ...), uniform within +-``width`` times the config's
         scale."""
-        return np.asarray(self.config.scale * width * self.draws.uniform(-1.0, 1.0, shape))
+        return self.config.scale * width * self.draws.uniform(-1.0, 1.0, shape)

@@ -29,7 +29,7 @@ from tdgc.errors import InputError
 FloatArray = NDArray[np.float64]
 HeightArray = NDArray[np.float32]
 
-#: Edition of TDGC-Bench that these tiles belong to; the first edition had fixed layouts.
+#: Edition of TDGC-Bench that these tiles belong to, whose layouts are drawn for each tile.
 EDITION = 2
 
 # Families and levels: Sec. III-A. Mixed and the levels above 10 are for evaluation only.
@@ -322,7 +322,7 @@ def pillar(section: Section, count: float, rng: np.random.Generator) -> Relief:
 
     Samples within a cylinder's radius are raised, so its wall slopes outwards over one cell.
     """
-    pillars = place(section, round(count * _share(section)), PILLAR_DIAMETER, rng)
+    pillars = draw_cylinders(section, round(count * _share(section)), PILLAR_DIAMETER, rng)
     relief = np.where(_within(pillars), PILLAR_HEIGHT, 0.0)
     return Relief(relief, Features(pillars=pillars), _NO_GROUND)
 
@@ -414,10 +414,10 @@ def clutter(section: Section, step: float, rng: np.random.Generator) -> Relief:
     circles = np.empty((0, 3))
     if obstacles == "walls":
         count = round(_share(section) * rng.integers(WALLS[0], WALLS[1] + 1))
-        circles = _walls(place(section, count, WALL_LENGTH, rng), rng)
+        circles = _walls(draw_cylinders(section, count, WALL_LENGTH, rng), rng)
     elif obstacles != "none":
         count = round(_share(section) * rng.integers(OBSTACLES[0], OBSTACLES[1] + 1))
-        circles = place(section, count, OBSTACLE_DIAMETER, rng)
+        circles = draw_cylinders(section, count, OBSTACLE_DIAMETER, rng)
     level = -TRENCH_DEPTH if obstacles == "pits" else PILLAR_HEIGHT
     heights = np.where(_within(circles), level, ground)
     return Relief(heights, Features(pillars=circles), ground)
@@ -440,7 +440,7 @@ def _paving(step: float, rng: np.random.Generator) -> FloatArray:
     stones = step * rng.uniform(-0.5, 0.5, (128, 128))  # more than fit on a tile
     u, v = _turned(_PLANE - TILE_SIZE / 2, turn)
     row, col = np.floor(u / side[0]).astype(int), np.floor(v / side[1]).astype(int)
-    return np.asarray(stones[row, col])  # negative indices wrap around
+    return stones[row, col]  # negative indices wrap around
 
 
 def _with_slabs(
@@ -529,7 +529,7 @@ def file_label(family: str) -> str:
     return re.sub(r"[^\w.-]", "-", family)
 
 
-def place(
+def draw_cylinders(
     section: Section, count: int, diameters: tuple[float, float], rng: np.random.Generator
 ) -> FloatArray:
     """Draw centres and diameters (count, 3) in m of cylinders that keep their clearance.
@@ -620,6 +620,14 @@ class TileField:
         self.starts, self.goals = np.zeros((rows, cols, 3)), np.zeros((rows, cols, 2))
         self.features = {tile: Features() for tile in np.ndindex(rows, cols)}
 
+    @classmethod
+    def of(cls, tile: Tile) -> "TileField":
+        """A field of this one tile, whose heights cannot be changed, which makes worlds faster."""
+        field = cls((1, 1))
+        field.place(0, 0, tile)
+        field.heights.setflags(write=False)
+        return field
+
     def place(self, row: int, col: int, tile: Tile) -> None:
         """Copy a tile into the field, in place."""
         n, m, cut = TILE_SAMPLES, self._width, self._cut
@@ -633,7 +641,7 @@ class TileField:
         """World xy (..., 2) in m of the origins of the frames of the tiles at (row, col)."""
         index = np.stack(np.broadcast_arrays(row, col), axis=-1)
         pitch = np.array([TILE_SAMPLES, self._width]) * self.cell
-        return np.asarray(index * pitch - np.array([0.0, self.crop]))
+        return index * pitch - np.array([0.0, self.crop])
 
     def on_tile(
         self, row: ArrayLike, col: ArrayLike, x: ArrayLike, y: ArrayLike

@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -79,10 +79,10 @@ class _Client:
 
 
 #: Robots per Bullet client. For each robot's island Bullet walks all constraints of the client, so
-#: the time per robot grows with their number. Measured on a plane, a step takes 44 us per robot
-#: with 5 robots in a client, 46 with 10, 54 with 25, 75 with 50 and 122 with 100. Python's share is
-#: larger now that rotors are simulated, and Bullet's is smaller on a plane: there 36 robots are
-#: 12 % faster in two clients than in four.
+#: the time per robot grows with their number. On a plane without rotors, a step takes 44 us per
+#: robot with 5 robots in a client, 46 with 10, 54 with 25, 75 with 50 and 122 with 100. Each client
+#: costs Python time as well, more with rotors; on a plane, where Bullet's share is smaller, 36
+#: robots with rotors are 12 % faster in two clients than in four.
 CLIENT_ROBOTS, PLANE_CLIENT_ROBOTS = 10, 20
 
 
@@ -91,7 +91,8 @@ class World:
 
     Robots are spread over Bullet clients with at most ``CLIENT_ROBOTS`` each, or
     ``PLANE_CLIENT_ROBOTS`` on a plane; a client holds only its own robots' part of the field.
-    ``visual`` loads what pictures need, ``window`` opens Bullet's own window.
+    ``visual`` loads what pictures need, ``window`` opens Bullet's own window. The dynamics are
+    nominal at first; the caller changes their arrays in place and then calls ``apply_dynamics``.
 
     Raises:
         ConfigError: the robot's URDF is missing, or not of a robot that this package can drive.
@@ -99,6 +100,9 @@ class World:
 
     Attributes:
         state: the ``RobotState`` after the last step, push or reset.
+        friction: (M,) coefficient of friction of all links.
+        payload: (M,) kg, spread over the trunk.
+        armature: (M,) kg m^2, rotor inertia of each joint, as in ``tdgc.sim.rotors``.
         strength: (M, 1) motor strength, a factor on gains and torque limits.
         joint_friction: (M, 1) N m, dry friction in each joint.
         bullet_seconds: wall time spent inside Bullet's step so far.
@@ -120,8 +124,7 @@ class World:
         self.physics = physics
         self.field = field
         self._visual = visual
-        self.strength = np.ones((num_robots, 1))
-        self.joint_friction = np.zeros((num_robots, 1))
+        self._make_dynamics()
         self.bullet_seconds = 0.0
         urdf = read_urdf(robot)
         self.state = RobotState.zeros(geometry_of(urdf), num_robots)
@@ -143,8 +146,14 @@ class World:
         self._centre, self._axes = map(np.array, trunk[3:5])
         self._to_axes = rotation_matrix(self._axes[None])[0].T
         self._inertia = {link: self._links_inertia(link) for link in (_TRUNK, *self._joints)}
-        self._armature = np.zeros(num_robots)
         self._active = np.arange(num_robots)
+
+    def _make_dynamics(self) -> None:
+        """Create the arrays of the dynamics, with nominal values."""
+        m = self.num_robots
+        self.friction = np.full(m, self.physics.friction)
+        self.payload, self.armature = np.zeros((2, m))
+        self.strength, self.joint_friction = np.ones((m, 1)), np.zeros((m, 1))
 
     def _connect(self, rows: NDArray[np.int64], urdf: Path, window: bool) -> None:
         """Create a client for the robots ``rows`` (n,), with their ground."""
@@ -269,23 +278,18 @@ class World:
         )
         return int(body)
 
-    def reset_robots(
-        self,
-        index: Iterable[int] | NDArray[np.integer],
-        position: Array,
-        quaternion: Array,
-        q: Array,
-    ) -> None:
+    def reset_robots(self, index: ArrayLike, position: Array, quaternion: Array, q: Array) -> None:
         """Place the robots ``index`` (n,) at rest at ``position`` (n, 3), ``quaternion`` (n, 4)
         with joint angles ``q`` (n, 12), and refresh ``state``."""
-        state = self.state
-        for k, i in enumerate(index):
-            state.position[i], state.quaternion[i], state.q[i] = position[k], quaternion[k], q[k]
-            for still in (state.lin_vel, state.ang_vel, state.qd, state.torque, state.rotor_excess):
-                still[i] = 0.0
-            state.foot_force[i] = state.leg_force[i] = 0.0
-            state.trunk_force[i] = 0.0
-            self._put(int(i))
+        state, rows = self.state, np.asarray(index, dtype=np.intp)
+        state.position[rows], state.quaternion[rows], state.q[rows] = position, quaternion, q
+        for still in (
+            state.lin_vel, state.ang_vel, state.qd, state.torque, state.rotor_excess,
+            state.foot_force, state.leg_force, state.trunk_force,
+        ):  # fmt: skip
+            still[rows] = 0.0
+        for i in rows.tolist():
+            self._put(i)
         state.derive()
 
     def _put(self, i: int) -> None:
@@ -298,7 +302,7 @@ class World:
 
     def _to_centre(self, i: int) -> Array:
         """Vector from the trunk's origin to its centre of mass in the world frame, (3,) m."""
-        return np.asarray(rotation_matrix(self.state.quaternion[i : i + 1])[0] @ self._centre)
+        return rotation_matrix(self.state.quaternion[i : i + 1])[0] @ self._centre
 
     def _place_trunk(self, i: int, position: Array) -> None:
         """Move the trunk of robot ``i`` to ``position`` (3,), with its orientation in ``state``."""
@@ -357,40 +361,29 @@ class World:
         rotors[axes[1].argmax()] += leftward
         return np.array(inertia), rotors
 
-    def set_dynamics(
-        self, index: ArrayLike, friction: Array, payload: Array, armature: Array
-    ) -> None:
-        """Set the friction of all links, the trunk's payload and the rotor inertia of the joints.
-
-        The last is as in ``tdgc.sim.rotors``.
-
-        Args:
-            index: (n,) robots.
-            friction: (n,).
-            payload: (n,) kg.
-            armature: (n,) kg m^2.
-        """
+    def apply_dynamics(self, index: ArrayLike) -> None:
+        """Pass on changes of ``friction``, ``payload`` and ``armature`` of the robots ``index``
+        (n,) to the simulator; ``strength`` and ``joint_friction`` are read at every step."""
         nominal = self.state.geometry.trunk_mass
-        for k, i in enumerate(np.asarray(index)):
-            self._armature[i] = armature[k]
+        for i in np.asarray(index):
             body, client = self._bodies[i], self._client_of[i]
-            mass = nominal + float(payload[k])
+            friction, mass = float(self.friction[i]), nominal + float(self.payload[i])
             for link in (_TRUNK, *sorted(self._joints)):
-                client.changeDynamics(body, link, lateralFriction=float(friction[k]))
+                client.changeDynamics(body, link, lateralFriction=friction)
             client.changeDynamics(body, _TRUNK, mass=mass)  # first: it resets the inertia
             for link, (inertia, rotors) in self._inertia.items():
                 # The payload is spread over the trunk, so the inertia scales with the mass.
                 grown = inertia * (mass / nominal) if link == _TRUNK else inertia
-                about = (grown + float(armature[k]) * rotors).tolist()
+                about = (grown + float(self.armature[i]) * rotors).tolist()
                 client.changeDynamics(body, link, localInertiaDiagonal=about)
 
     def push(self, index: ArrayLike, velocity: Array) -> None:
-        """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index``, and refresh
-        ``state``."""
-        state = self.state
-        for k, i in enumerate(np.asarray(index)):
-            state.lin_vel[i] += velocity[k]
-            self._move_trunk(int(i))
+        """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index`` (n,), which are
+        distinct, and refresh ``state``."""
+        state, rows = self.state, np.asarray(index, dtype=np.intp)
+        state.lin_vel[rows] += velocity
+        for i in rows.tolist():
+            self._move_trunk(i)
         state.derive()
 
     def retire(self, index: ArrayLike) -> None:
@@ -426,7 +419,7 @@ class World:
         interval = self.physics.hold * self.physics.dt
         passed = interval * np.arange(self.physics.joint_steps)[:, None]
         age = np.ceil(np.maximum(delay[live] - passed - 1e-9, 0.0) / self.physics.control_dt)
-        return np.asarray(targets[age.astype(int), live] + offset[live])
+        return targets[age.astype(int), live] + offset[live]
 
     def _step_client(self, client: _Client, live: NDArray[np.integer], wanted: Array) -> None:
         """Run all physics steps of one client's robots ``live`` (n,), with joint targets ``wanted``
@@ -443,7 +436,7 @@ class World:
         command, measure = pybullet.setJointMotorControlArray, pybullet.getJointStates
         strength, friction = self.strength[live], self.joint_friction[live]
         q, qd = state.q[live], state.qd[live]
-        armature = self._armature[live]
+        armature = self.armature[live]
         excess = np.where(armature[:, None] > 0.0, state.rotor_excess[live], 0.0)
         rotors = armature.any()
         if rotors:
@@ -537,7 +530,7 @@ class World:
     def trunk_height(self) -> Array:
         """Height of each trunk above the support surface under it, (M,) m."""
         x, y, z = self.state.position.T
-        return np.asarray(z - self.support_height(x, y))
+        return z - self.support_height(x, y)
 
     def picture(
         self,

@@ -44,11 +44,8 @@ class CommandDraw:
     def bounds(self, n: int) -> tuple[Array, Array, Array]:
         """Distribution of n free commands: gait probabilities, (n, 4), and lower and upper bounds
         of the continuous commands, (n, 12), before ``share`` scales the velocities."""
-        gaits, low, high = (
-            np.tile(each, (n, 1))
-            for each in (self._config.command_draw.gaits, self._low, self._high)
-        )
-        return gaits, low, high
+        gaits = np.tile(self._config.command_draw.gaits, (n, 1))
+        return gaits, np.tile(self._low, (n, 1)), np.tile(self._high, (n, 1))
 
     def draw(
         self, gaits: Array, low: Array, high: Array, free: NDArray[np.bool_]

@@ -18,13 +18,21 @@ from tdgc.sim.terrain import MAX_LEVEL, TILE_SIZE, TileField
 from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import Ground
-from tdgc.tasks.leaps import DURATION, SPEED, STRIDE, SWING_HEIGHT, Landing, LeapPlan, Motion
+from tdgc.tasks.leaps import (
+    DURATION,
+    SPEED,
+    STRIDE,
+    STRIDE_COMMANDS,
+    SWING_HEIGHT,
+    Landing,
+    LeapPlan,
+    Motion,
+)
 from tdgc.tasks.rules import GOAL_RADIUS
 from tdgc.tasks.tiles import FLAT
 
 Ints = NDArray[np.int64]
 _YAW_RATE, _PITCH = INDEX["yaw_rate"], INDEX["pitch"]
-_FREQUENCY, _LENGTH = INDEX["frequency"], INDEX["stance_length"]
 # m from a lip, further than leaps need: what is learned here is to land where commanded.
 _CLEAR = 0.08
 
@@ -35,7 +43,7 @@ def within(velocity: Array, low: Array, high: Array) -> Array:
     bound = np.where(velocity < 0.0, -low, high)
     free = bound > 0.0
     over = np.where(free, np.abs(velocity) / np.where(free, bound, 1.0), 0.0)
-    return np.asarray(np.where(free, velocity, 0.0) / np.maximum(over.max(axis=1), 1.0)[:, None])
+    return np.where(free, velocity, 0.0) / np.maximum(over.max(axis=1), 1.0)[:, None]
 
 
 class Crossings:
@@ -131,8 +139,8 @@ class Crossings:
         values[leaps, swing] = rng.uniform(low, highest, int(leaps.sum()))
         for j, usual in (
             (INDEX["duration"], DURATION),  # that landings are planned for
-            (_FREQUENCY, SPEED / STRIDE),  # until the first landing is planned
-            (_LENGTH, STRIDE),
+            # Until the first landing is planned.
+            *zip(STRIDE_COMMANDS, (SPEED / STRIDE, STRIDE), strict=True),
         ):
             values[leaps, j] = np.clip(usual, self._low[j], self._high[j])
         e.leaping[index] = leaps
@@ -174,8 +182,8 @@ class Crossings:
         if rows.size:
             x = (state.position[:, 0] - e.origin[:, 0])[rows]
             motion = Motion.of(loco, rows, x, state.heading_vel[rows, 0], e.speed[rows])
-            frequency, length = self._plan.steps(rows, motion, self.landing)
-            loco.command[rows, _FREQUENCY], loco.command[rows, _LENGTH] = frequency, length
+            strides = self._plan.steps(rows, motion, self.landing)
+            loco.command[np.ix_(rows, STRIDE_COMMANDS)] = np.column_stack(strides)
 
     def learn_landing(self, loco: Locomotion, clock: Array) -> None:
         """Learn where feet land from the leaps of a step; ``clock`` (M,) is from before it."""

@@ -44,33 +44,25 @@ def check_rules(window: int, threshold: int, max_level: int) -> None:
 def update_level(
     level: ArrayLike, successes: ArrayLike, window: int, threshold: int, max_level: int
 ) -> Ints:
-    """Apply the two rules of Sec. IV-C to a full window.
+    """Levels after the two rules of Sec. IV-C, for full windows with so many ``successes``.
 
-    Args:
-        level: current level, any shape, in 0..max_level - 1.
-        successes: number of successful episodes among the last ``window``, same shape.
-        window: W, episodes.
-        threshold: S, episodes.
-        max_level: L_max, the number of levels.
-
-    Returns:
-        The new level, same shape.
+    ``level`` and ``successes`` have the same shape; the levels are in 0..max_level - 1.
 
     Raises:
         ValueError: invalid rules, see ``check_rules``.
     """
     check_rules(window, threshold, max_level)
-    now, count = np.asarray(level, dtype=np.int64), np.asarray(successes)
-    up = np.minimum(now + 1, max_level - 1)
-    down = np.maximum(now - 1, 0)
-    return np.where(count >= threshold, up, np.where(count < window - threshold + 1, down, now))
+    count = np.asarray(successes)
+    up, down = count >= threshold, count < window - threshold + 1
+    return np.clip(np.asarray(level) + up - down, 0, max_level - 1)
 
 
 class Curriculum:
     """Levels and windows of ``n`` independent environments.
 
     Attributes:
-        levels: (n,), the level of each environment; callers read it, ``push`` changes it.
+        levels: (n,), the level of each environment. ``push`` changes it; a caller with another
+            curriculum may write levels in 0..max_level - 1 instead.
         outcomes: (n, window) of bool, oldest episode first; empty slots come first and are False.
         counts: (n,), how many slots are filled.
     """

@@ -1,4 +1,4 @@
-"""The executor: the lower half of the paper's closed loop, commands -> joint targets -> physics."""
+"""The lower half of the paper's closed loop: commands -> low policy -> joint targets -> physics."""
 
 from typing import Any, Protocol
 
@@ -21,11 +21,16 @@ class Carries(Protocol):
     """What the closed loop needs from an executor."""
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
-        """Run one control step under ``commands`` (M, 15); the robots ``rows`` (n,) act."""
+        """Run one control step.
+
+        Args:
+            commands: (M, 15).
+            rows: (n,) the robots that act; the others repeat their last action. All by default.
+        """
 
 
 class Executor:
-    """M robots that follow commands through a frozen low policy.
+    """M robots that follow commands through a frozen low policy; implements ``Carries``.
 
     Args:
         loco: the M robots.
@@ -38,12 +43,6 @@ class Executor:
         self._actions = np.zeros((loco.num_robots, NUM_JOINTS), dtype=np.float32)
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
-        """Run one control step: commands -> low policy -> joint targets -> physics.
-
-        Args:
-            commands: (M, 15).
-            rows: (n,) the robots that act; the others repeat their last action. All by default.
-        """
         self.loco.command[:] = commands
         seen = self.loco.observe(self._noise)
         rows = np.arange(len(seen)) if rows is None else rows

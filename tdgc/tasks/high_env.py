@@ -22,7 +22,7 @@ from tdgc.sim.terrain import draw_start_goal
 from tdgc.state import State, copies, fill
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, HighObserver, high_spaces
+from tdgc.tasks.high_observation import GUIDANCE, HighObserver, high_spaces, semantic_index
 from tdgc.tasks.high_rewards import HighReward
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.pushes import Pushes
@@ -38,8 +38,8 @@ class NavigationTask:
 
     Actions are (M, 13) in [-a_max, a_max]; they are decoded and held for ``decimation`` control
     steps of the frozen low policy. An episode fails when the trunk is too low or hits something too
-    hard, or when the robot leaves its tile. It is truncated after 20 s, or 2 s after the goal was
-    reached.
+    hard, or when the robot leaves its tile. It is truncated after ``episode_seconds``, or
+    ``hold_seconds`` after the goal was reached.
 
     Args:
         config: the MDP's configuration.
@@ -86,14 +86,15 @@ class NavigationTask:
         alter = None
         if training and config.shallowest_trench is not None:
             alter = functools.partial(shallow, shallowest=config.shallowest_trench)
-        self._families = [config.families[f] for f in self.family]
-        self.tiles = TrainingTiles(self._families, seed, alter)
+        families = [config.families[f] for f in self.family]
+        self.tiles = TrainingTiles(families, seed, alter)
         self.field = self.tiles.field
         self._build_robots()
         self._origin = self.field.origin(np.arange(m), 0)
         self.goal = np.zeros((m, 2))
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._reached_at = np.full(m, -1)
+        self._told = np.array([semantic_index(family) for family in families])
         # Not told its family in this episode: without the semantic cue, no robot is.
         semantic = config.cues in ("both", "semantic")
         self._unknown_share = config.unknown_share if semantic else 1.0
@@ -151,7 +152,7 @@ class NavigationTask:
 
     def _expects(self) -> NDArray[np.bool_]:
         """Which robots are told that there are trenches on their tile, (M,)."""
-        return self.family_index == SEMANTIC.index("gap")
+        return self.family_index == semantic_index("gap")
 
     def _width(self) -> Array:
         """Scale of each robot's disturbances, (M,), growing with its level from 0 to 1."""
@@ -237,9 +238,7 @@ class NavigationTask:
     @property
     def family_index(self) -> NDArray[np.int64]:
         """Index into ``SEMANTIC`` of the family that each robot observes, (M,)."""
-        unknown = SEMANTIC.index("unknown")
-        told = np.array([SEMANTIC.index(n) if n in SEMANTIC else unknown for n in self._families])
-        return np.where(self._untold, unknown, told)
+        return np.where(self._untold, semantic_index("unknown"), self._told)
 
     # ------------------------------------------------------------------ statistics, resume
 

@@ -46,6 +46,11 @@ GUIDANCE = sum(GUIDANCE_PARTS.values())
 SEMANTIC = (*FAMILIES, "unknown")
 
 
+def semantic_index(family: str) -> int:
+    """Index into ``SEMANTIC``: that of "unknown" for any other family."""
+    return SEMANTIC.index(family if family in SEMANTIC else "unknown")
+
+
 class HighSources(NamedTuple):
     """The sources of o^H for M robots.
 

@@ -221,4 +221,4 @@ class HighReward:
         return high_terms(step, self._seconds)
 
     def _shares(self, commands: Array) -> Array:
-        return np.asarray((commands - self._decoder.low) / self._span)
+        return (commands - self._decoder.low) / self._span

@@ -36,7 +36,7 @@ STRIDE = 0.39  # m, preferred stride of a leap: with longer ones robots trip at 
 #: 1 cm off, 29 of 30 tiles of level 10 can be crossed with this limit, and 20 with 0.45 m.
 LONGEST = 0.48
 BEYOND = 0.5  # m behind the last trench, at which leaping ends
-_TURN = 1.5  # 1/s, yaw rate per rad of heading error in a leap; as in ``teacher.toward``
+HEADING_GAIN = 1.5  # 1/s, yaw rate per rad of heading error, in a walk as in a leap
 _STEP = 0.01  # m, grid spacing of a plan
 _STRIDES = np.arange(28, 47, 2)  # in units of _STEP: strides at 0.95 SPEED and 2.5 to 4 Hz
 #: m from a trench's edge (its lip), beyond which a foot is safe. Of 40 robots that were told where
@@ -51,7 +51,8 @@ _LENGTH_PRICE = 2.0  # 1/m^2, for the squared distance of rear feet from where t
 # 4 with neither rule, 23 and 5 with the first alone (21 and 8 with 0.5 of the cycle), and 24 and 11
 # with both at 0.5 of the cycle (docs/experiments.md).
 _DECIDED, _CHANGE_PRICE = 0.4, 0.5
-_STRIDE = [INDEX["frequency"], INDEX["stance_length"]]
+#: Commands that decide on the next stride: step frequency and stance length.
+STRIDE_COMMANDS = [INDEX["frequency"], INDEX["stance_length"]]
 FREQUENCIES, LENGTHS = 25, 11  # how many are tried at each decision, evenly over the command ranges
 # How leaping robots speed up, from two low policies: 0.8, 1.1 and 1.2 m/s at the first landings
 # from rest, and 1.14 m/s in the long run when 1.2 is commanded. Without this model, landings at a
@@ -113,7 +114,7 @@ class Landing:
         if seen.size:
             feet = state.foot_position[seen, :, 0]
             command, speed = loco.executed()[seen], state.lin_vel[seen, 0]
-            frequency, length = command[:, INDEX["frequency"]], command[:, INDEX["stance_length"]]
+            frequency, length = command[:, STRIDE_COMMANDS].T
             trunk = state.position[seen, 0] - clock[landed] / frequency * speed
             front, rear = feet[:, :2].mean(axis=1), feet[:, 2:].mean(axis=1)
             foothold = trunk + 0.5 * length + lead(speed, frequency)
@@ -160,7 +161,7 @@ class Motion(NamedTuple):
         cls, loco: Locomotion, rows: NDArray[np.integer], x: Array, speed: Array, commanded: Array
     ) -> "Motion":
         """The motion of the robots ``rows`` (n,), with their own clocks and strides."""
-        frequency, length = loco.command[rows][:, _STRIDE].T
+        frequency, length = loco.command[rows][:, STRIDE_COMMANDS].T
         return cls(x, speed, commanded, loco.clock.clock[rows], frequency, length)
 
 
@@ -276,7 +277,7 @@ class LeapPlan:
         dear = _STRIDE_PRICE * (stride - STRIDE) ** 2
         dear += _FALL * (motion.commanded[:, None] / self._frequencies > LONGEST)
         dear += _CHANGE_PRICE * (self._frequencies - motion.frequency[:, None]) ** 2
-        return np.asarray(cost + dear[:, :, None])
+        return cost + dear[:, :, None]
 
 
 def leap_command(command: Array, frequency: ArrayLike, length: ArrayLike) -> None:
@@ -305,7 +306,7 @@ def steer_leap(
     """
     wanted = (
         ("vx", speed * np.cos(bearing - heading)), ("vy", speed * np.sin(bearing - heading)),
-        ("yaw_rate", -_TURN * heading),
+        ("yaw_rate", -HEADING_GAIN * heading),
     )  # fmt: skip
     for name, value in wanted:
         command[:, INDEX[name]] = np.clip(value, *getattr(ranges, name))

@@ -44,8 +44,8 @@ class LowLevelTask:
 
     Observation rows are [actor part | critic part], see ``tdgc.tasks.low_observation``. Actions are
     (M, 12) in [-a_max, a_max]. An episode ends in failure when the trunk is less than 0.15 m above
-    the support surface or hits something with more than 40 N. It is truncated after 20 s, when the
-    robot leaves its tile, or when it has crossed it.
+    the support surface or hits something with more than 40 N. It is truncated after
+    ``episode_seconds``, when the robot leaves its tile, or when it has crossed it.
 
     Args:
         config: the MDP's configuration.

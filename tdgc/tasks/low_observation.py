@@ -36,11 +36,11 @@ def _dynamics(seen: CriticSources) -> Array:
     loco, world = seen.loco, seen.loco.world
     return np.stack(
         [
-            loco.friction,
-            loco.payload / 3.0,
+            world.friction,
+            world.payload / 3.0,
             5.0 * (world.strength[:, 0] - 1.0),
             loco.delay / 0.03,
-            100.0 * loco.armature,
+            100.0 * world.armature,
             5.0 * world.joint_friction[:, 0],
         ],
         axis=1,
@@ -49,7 +49,8 @@ def _dynamics(seen: CriticSources) -> Array:
 
 _PROBE_SWAP = tuple(3 * (i // 3) + 2 - i % 3 for i in range(len(GROUND_PROBES)))
 _PROBES = Flip(_PROBE_SWAP, (1.0,) * len(GROUND_PROBES))
-#: The critic's own part of the observation, which the actor never sees.
+#: The critic's own part of the observation, which the actor never sees. The scales of velocities
+#: and terrain are those of Walk These Ways; the other heights are scaled to be of order one.
 CRITIC_LAYOUT: tuple[Term[CriticSources], ...] = (
     Term("velocity", 3, lambda s: s.loco.world.state.heading_vel, 2.0, mirror=VECTOR_FLIP),
     Term(

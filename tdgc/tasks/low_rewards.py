@@ -20,7 +20,7 @@ from tdgc.sim.robot import Array, RobotState, foot_travel
 
 _SOFT_LIMIT = 0.9  # share of a joint's range without a penalty (Walk These Ways)
 _FORCE_SCALE = 100.0  # N^2, swing contact force (Walk These Ways)
-_SPEED_SCALE = 10.0  # m^2/s^2, stance foot speed (Walk These Ways)
+_FOOT_SPEED_SCALE = 10.0  # m^2/s^2, stance foot speed (Walk These Ways)
 _STANCE = [INDEX["stance_length"], INDEX["stance_width"]]
 _LEG_FORCE = 0.1  # N, above which a leg contact counts (Walk These Ways)
 
@@ -65,12 +65,12 @@ class LowStep:
 
     def cmd(self, name: str) -> Array:
         """One command by name, (M,)."""
-        return np.asarray(self.command[:, INDEX[name]])
+        return self.command[:, INDEX[name]]
 
 
 def square_sum(x: Array) -> Array:
     """Sum of squares along the last axis, (..., n) -> (...)."""
-    return np.asarray(np.einsum("...i,...i->...", x, x))
+    return np.einsum("...i,...i->...", x, x)
 
 
 def track_lin_vel(s: LowStep) -> Array:
@@ -110,7 +110,7 @@ def raibert_targets(command: Array, phases: Array, stance: tuple[float, float]) 
     """
     rectangle = command[:, _STANCE] + (np.array(stance) - default_command()[_STANCE])
     rest = 0.5 * rectangle[:, None, :] * np.stack([FRONT, SIDE], axis=1)
-    return np.asarray(rest + foot_travel(command, phases, rest))
+    return rest + foot_travel(command, phases, rest)
 
 
 def raibert_foothold(s: LowStep) -> Array:
@@ -119,7 +119,7 @@ def raibert_foothold(s: LowStep) -> Array:
     c, d = np.cos(s.state.yaw)[:, None], np.sin(s.state.yaw)[:, None]
     feet = np.stack([c * arm[..., 0] + d * arm[..., 1], c * arm[..., 1] - d * arm[..., 0]], axis=-1)
     error = feet - raibert_targets(s.command, s.phases, s.stance)
-    return np.asarray(np.einsum("mfi,mfi->m", error, error))
+    return np.einsum("mfi,mfi->m", error, error)
 
 
 def swing_height(s: LowStep) -> Array:
@@ -138,7 +138,7 @@ def swing_contact_force(s: LowStep) -> Array:
 def stance_foot_speed(s: LowStep) -> Array:
     """Motion in stance: mean of C (1 - exp(-|v_foot|^2 / 10 m^2/s^2))."""
     speed2 = square_sum(s.state.foot_velocity)
-    return np.mean(s.contact * (1.0 - np.exp(-speed2 / _SPEED_SCALE)), axis=1)
+    return np.mean(s.contact * (1.0 - np.exp(-speed2 / _FOOT_SPEED_SCALE)), axis=1)
 
 
 def target_rate(s: LowStep) -> Array:
@@ -177,7 +177,7 @@ def joint_limits(s: LowStep) -> Array:
 
 def vertical_velocity(s: LowStep) -> Array:
     """Squared vertical velocity of the trunk, m^2/s^2."""
-    return np.asarray(s.state.lin_vel[:, 2] ** 2)
+    return s.state.lin_vel[:, 2] ** 2
 
 
 def tilt_rate(s: LowStep) -> Array:
@@ -259,11 +259,6 @@ def total(
     The sign of its weight decides a term's group. ``penalty``, (M,) or a scalar, is the share of
     the negative terms that counts.
     """
-    positive: Array | float = 0.0
-    negative: Array | float = 0.0
-    for name, value in terms.items():
-        if getattr(weights, name) > 0.0:
-            positive = positive + value
-        else:
-            negative = negative + value
+    positive = sum(value for name, value in terms.items() if getattr(weights, name) > 0.0)
+    negative = sum(value for name, value in terms.items() if not getattr(weights, name) > 0.0)
     return np.asarray(dt * positive * np.exp(penalty * negative))

@@ -7,20 +7,17 @@ walks with faster steps, and slower leaps (docs/experiments.md).
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tdgc.config import FIRST_TEACHER, HighLevelConfig, TeacherConfig, recorded
+from tdgc.policies import Policy
 from tdgc.sim.commands import NUM_ACTIONS
 from tdgc.sim.terrain import MAX_LEVEL, may_have_trenches
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.teacher import Skill
-
-if TYPE_CHECKING:
-    from tdgc.policies import Policy
 
 #: Walks that are tried besides the usual one: m/s, and Hz of the steps.
 WALKS = ((0.75, 2.8), (0.9, 3.3))
@@ -34,7 +31,7 @@ _SEED = 0
 _BETTER = 5
 
 
-def find_manner(low: "Policy", env: HighLevelConfig, tell: Callable[[str], None]) -> TeacherConfig:
+def find_manner(low: Policy, env: HighLevelConfig, tell: Callable[[str], None]) -> TeacherConfig:
     """Find out how the teacher best commands ``low`` on stairs and over trenches.
 
     Leaps are tried only if ``env.families`` may have trenches.
@@ -68,7 +65,7 @@ def find_manner(low: "Policy", env: HighLevelConfig, tell: Callable[[str], None]
     return best
 
 
-def manner_of(high: "Policy", source: object) -> TeacherConfig:
+def manner_of(high: Policy, source: object) -> TeacherConfig:
     """The manner of the teacher that the policy ``high`` of the file ``source`` imitated; the first
     one if it records none.
 
@@ -95,7 +92,7 @@ def choose(
 
 
 def arrivals(
-    low: "Policy", env: HighLevelConfig, manner: TeacherConfig, family: str, robots: int = ROBOTS
+    low: Policy, env: HighLevelConfig, manner: TeacherConfig, family: str, robots: int = ROBOTS
 ) -> int:
     """Count the robots that the teacher leads over tiles of levels 5 to 10, always the same."""
     landing = measure_landing(*load_low(low), manner.leap_speed) if family == "gap" else None

@@ -4,11 +4,15 @@ import numpy as np
 
 from tdgc.sim.robot import Array
 
-LOOK = 0.35  # m ahead, the distance at which a robot compares costs in different directions
+#: m ahead, at which a robot compares costs in different directions: further than ``RADIUS``, so
+#: that it sees the way out from where it is blocked.
+LOOK = 0.35
 #: m from an obstacle within which the way is blocked: half the trunk's diagonal and a little.
 #: Pillars leave at least 0.6 m between them.
 RADIUS = 0.28
-_BLOCKED, _CLOSE = 30.0, 3.0  # cost per metre inside the radius and at its edge; 1 in the open
+# Cost per metre inside the radius and at its edge; 1 in the open. The way straight across an
+# obstacle, at least 0.56 m, then costs more than 16 m in the open, two lengths of a tile.
+_BLOCKED, _CLOSE = 30.0, 3.0
 _AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 
 

@@ -18,7 +18,7 @@ _ASIDE = [(0.2 * i - 0.1, side * (0.2, 0.4)[i % 2]) for i in range(6) for side i
 #: needs that distance to get into its stride (docs/experiments.md). Its lines of probes are 20 cm
 #: apart, so that no pillar, at least 20 cm wide, slips between them as they sweep over the ground.
 #: They extend beside the trunk, too: a robot that leans on a pillar has to know where it is.
-#: Earlier policies use ``lines``, every 5 cm straight ahead; the first ones use ``staggered``.
+#: ``lines``, every 5 cm straight ahead, and ``staggered`` are for policies trained with them.
 PROBES: dict[str, Array] = {
     "graded": np.array(_FURTHER + _ASIDE),
     "lines": np.array(_AHEAD + _ASIDE),

@@ -184,11 +184,11 @@ def _padded(grid: NDArray[Any], axis: int, n: int, **beyond: Any) -> NDArray[Any
 
 def _mean(grid: Array, axis: int, n: int) -> Array:
     """Mean over the ``n`` samples to both sides along an axis."""
-    return np.asarray(_windows(grid, axis, n, **_SLOPING_ON).mean(axis=-1))
+    return _windows(grid, axis, n, **_SLOPING_ON).mean(axis=-1)
 
 
 def _close(grid: Array, n: int) -> Array:
     """A grid with dips along x filled that are narrower than ``n`` samples, an odd number, from
     lip to lip."""
     wide = _windows(grid, 0, n // 2, mode="edge").max(axis=-1)
-    return np.asarray(_windows(wide, 0, n // 2, mode="edge").min(axis=-1))
+    return _windows(wide, 0, n // 2, mode="edge").min(axis=-1)

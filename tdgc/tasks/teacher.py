@@ -23,6 +23,7 @@ from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
 from tdgc.tasks.leaps import (
     BEYOND,
     FREQUENCIES,
+    HEADING_GAIN,
     LENGTHS,
     SPEED,
     Landing,
@@ -38,7 +39,7 @@ from tdgc.tasks.survey import GRID, survey
 
 @dataclass(frozen=True)
 class Style:
-    """How to walk in trot.
+    """How to walk in trot, or to leap in pronk; the gait is not part of it.
 
     Attributes:
         speed: m/s, forward.
@@ -119,7 +120,7 @@ _APART = 0.9  # rad, least angle between two ways whose mean would lead into the
 WAY = [INDEX[name] for name in ("vx", "vy", "yaw_rate")]
 
 
-_DISTANCE_GAIN, _HEADING_GAIN = 1.0, 1.5  # 1/s
+_DISTANCE_GAIN = 1.0  # 1/s: a robot slows down where it could arrive within a second
 
 
 def toward(
@@ -139,7 +140,7 @@ def toward(
         turns: rad/s, lowest and highest yaw rate.
     """
     speed = np.minimum(top_speed, _DISTANCE_GAIN * distance)
-    turn = np.clip(_HEADING_GAIN * error, *turns)
+    turn = np.clip(HEADING_GAIN * error, *turns)
     return speed * np.maximum(np.cos(error), 0.0), turn
 
 
@@ -251,7 +252,7 @@ class Teacher:
         m, n, width = self._slope.shape
         at = np.round((local - [0.0, self._field.crop]) / CELL).astype(int)
         i, j = np.clip(at, 0, [n - 1, width - 1]).T
-        return np.asarray(self._slope[np.arange(m), i, j])
+        return self._slope[np.arange(m), i, j]
 
     def _walk(
         self,
