@@ -30,13 +30,13 @@ from tdgc.config import (
     with_overrides,
 )
 from tdgc.files import checksum
-from tdgc.learn.flags import add_arguments, configure, worker_link
+from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, check_batch, shared_keywords
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, MemoryExchange
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
-from tdgc.parallel.worker import MakeLink, WorkerError
+from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Policy
 from tdgc.policies.files import files_of
 from tdgc.policies.learning import MirroredHead
@@ -91,16 +91,16 @@ def with_low(config: HighTrainConfig, assignments: Sequence[str]) -> HighTrainCo
     return dataclasses.replace(config, low=low, env=env)
 
 
-def pin_low(config: HighTrainConfig) -> HighTrainConfig:
-    """Add the checksum of the low policy to the configuration.
+def pin_low(config: HighTrainConfig, path: str) -> HighTrainConfig:
+    """Add the low policy's path and checksum to the configuration.
 
     Raises:
         ConfigError: the low policy is not the one that the run began with.
     """
-    found = checksum(files_of(cast(str, config.low))[0])
+    found = checksum(files_of(path)[0])
     if config.low_sha256 not in (None, found):
-        raise ConfigError(f"{config.low} is not the low policy that this run began with")
-    return dataclasses.replace(config, low_sha256=found)
+        raise ConfigError(f"{path} is not the low policy that this run began with")
+    return dataclasses.replace(config, low=path, low_sha256=found)
 
 
 def with_manner(config: HighTrainConfig, low: Policy, init: Path | None) -> HighTrainConfig:
@@ -155,7 +155,7 @@ def start_walking(policy: FastRecurrentPolicy, config: HighTrainConfig) -> None:
 
 
 def make_env(
-    config: HighTrainConfig, low: Policy, taught: bool, led: float, timeout: float, link: MakeLink
+    config: HighTrainConfig, low: Policy, taught: bool, led: float, machine: Machine
 ) -> TaskVecEnv:
     """Start the workers; ``led`` as in ``NavigationTask``, ``taught``: whether with a teacher."""
     env_config, skill = config.env, None
@@ -174,8 +174,8 @@ def make_env(
         config.seed,
         high_spaces(env_config, taught),
         recover=True,
-        timeout=timeout,
-        link=link,
+        timeout=machine.timeout,
+        link=machine.link,
     )
 
 
@@ -222,7 +222,7 @@ def make_learner(
 
 
 def build_imitation(
-    config: HighTrainConfig, low: Policy, device: str, timeout: float, link: MakeLink
+    config: HighTrainConfig, low: Policy, machine: Machine
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
     """Build the apprentice, and workers with a teacher."""
     imitation = config.imitation
@@ -231,9 +231,9 @@ def build_imitation(
     )
     led = _LED * (min(imitation.steps, config.steps) // config.n_envs)
     shown = dataclasses.replace(config, env=mdp)
-    env = make_env(shown, low, True, led, timeout, link)
+    env = make_env(shown, low, True, led, machine)
     model = make_learner(
-        Apprentice, ApprenticePolicy, env, config, device,
+        Apprentice, ApprenticePolicy, env, config, machine.device,
         learning_rate=LinearRate(imitation.learning_rate, imitation.final_learning_rate),
         n_epochs=imitation.n_epochs,
         kept=imitation.kept,
@@ -243,7 +243,7 @@ def build_imitation(
 
 
 def build_reinforcement(
-    config: HighTrainConfig, low: Policy, device: str, timeout: float, link: MakeLink
+    config: HighTrainConfig, low: Policy, machine: Machine
 ) -> tuple[FastRecurrentPPO, TaskVecEnv]:
     """Build the learner and workers of reinforcement learning.
 
@@ -253,10 +253,9 @@ def build_reinforcement(
         mdp = dataclasses.replace(config.env, first_level=config.env.levels - 1, first_levels=1)
         config = dataclasses.replace(config, env=mdp)
     taught = bool(config.imitation.steps) and config.ppo.imitation_coef > 0.0
-    env = make_env(config, low, taught, 0.0, timeout, link)
-    model = make_learner(
-        FastRecurrentPPO, TaughtPolicy if taught else FastRecurrentPolicy, env, config, device
-    )
+    env = make_env(config, low, taught, 0.0, machine)
+    policy = TaughtPolicy if taught else FastRecurrentPolicy
+    model = make_learner(FastRecurrentPPO, policy, env, config, machine.device)
     if taught:
         # The policy returns the loss as part of the entropy, which SB3 multiplies by ``ent_coef``.
         weight = config.ppo.imitation_coef / config.ppo.ent_coef
@@ -269,7 +268,7 @@ def begins_hardest(config: HighTrainConfig) -> bool:
     return bool(config.imitation.steps) and config.imitation.levels_after == "hardest"
 
 
-def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
+def phases(config: HighTrainConfig, low: Policy, machine: Machine) -> list[Phase]:
     """Return the phases: imitation of the teacher, if any, then reinforcement learning."""
     imitated = min(config.imitation.steps, config.steps)
     both = (
@@ -277,7 +276,7 @@ def phases(config: HighTrainConfig, low: Policy, device: str) -> list[Phase]:
         ("learning", build_reinforcement, config.steps, begins_hardest(config)),
     )
     return [
-        Phase(name, functools.partial(build, config, low, device), until, own_levels)
+        Phase(name, functools.partial(build, config, low, machine), until, own_levels)
         for name, build, until, own_levels in both
         if until > 0
     ]
@@ -315,7 +314,7 @@ def check(config: HighTrainConfig, control_dt: float) -> None:
                 f"not {minibatches}"
             )
         steps = ppo.n_steps * config.n_envs // minibatches
-        check_batch(f"ppo.n_steps' times 'n_envs' per '{name}.minibatches", steps)
+        check_batch(f"'ppo.n_steps' times 'n_envs' per '{name}.minibatches'", steps)
     episode_steps(env.episode_seconds, env.decimation * control_dt)
     if not ppo.ent_coef:  # SB3 multiplies both terms by it
         for name, used in (("gait_ent_coef", True), ("imitation_coef", config.imitation.steps)):
@@ -356,10 +355,10 @@ def main(arguments: list[str] | None = None) -> int:
             raise ConfigError("--resume keeps the run's settings: no --preset or --no-teacher")
         start = with_overrides(HighTrainConfig(), preset)
         config = configure(start if args.resume else with_low(start, args.assignments), args)
-        config = dataclasses.replace(config, low=config.low or find_low())
-        low, low_config = load_low(cast(str, config.low))
-        config = pin_low(config)
-        tqdm.write(f"low policy: {config.low}")
+        path = config.low or find_low()
+        low, low_config = load_low(path)
+        config = pin_low(config, path)
+        tqdm.write(f"low policy: {path}")
         check_robot(low_config.robot, low_config.physics, config.env.randomisation)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check(config, low_config.physics.control_dt)
@@ -374,20 +373,14 @@ def main(arguments: list[str] | None = None) -> int:
         }
         if config.imitation.teacher is not None:
             meta["teacher"] = to_dict(config.imitation.teacher)
-        run = Run(
-            args.out, config, meta, summarise, interruption, args.worker_timeout,
-            worker_link(args), args.init,
-        )  # fmt: skip
-        run.train(phases(config, low, args.device), args.resume)
+        run = Run(args.out, config, meta, summarise, interruption, args.init)
+        run.train(phases(config, low, Machine.of(args)), args.resume)
         log = args.out / "log.jsonl"
         if log.exists():
             plots.decision_curve(log, args.out / "training.png")
-    except ValueError as error:
+    except (ValueError, WorkerError, OSError) as error:
         print(f"train_high.py: {error}", file=sys.stderr)
-        return 2
-    except (WorkerError, OSError) as error:
-        print(f"train_high.py: {error}", file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, ValueError) else 1
     return 0
 
 

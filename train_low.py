@@ -29,12 +29,12 @@ from tdgc.config import (
     with_overrides,
 )
 from tdgc.errors import StoppedError
-from tdgc.learn.flags import add_arguments, configure, worker_link
+from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.ppo import NoiseScaledRate, check_batch, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import TaskVecEnv
-from tdgc.parallel.worker import MakeLink, WorkerError
+from tdgc.parallel.worker import WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.show import plots
 from tdgc.sim.locomotion import actor_layout, check_robot
@@ -48,7 +48,7 @@ from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.tiles import check_families, check_levels
 
 
-def phases(config: LowTrainConfig, device: str) -> list[Phase]:
+def phases(config: LowTrainConfig, machine: Machine) -> list[Phase]:
     """Return the one phase of learning: robots on a plane, and on tiles with rising levels.
 
     Raises:
@@ -62,7 +62,7 @@ def phases(config: LowTrainConfig, device: str) -> list[Phase]:
     physics = dataclasses.replace(env.physics, substeps=steps, hold=1)
     plane = dataclasses.replace(env, terrain="plane", physics=physics)
     tiles = dataclasses.replace(env, terrain="tiles")
-    make = functools.partial(build, config, (plane, tiles), device)
+    make = functools.partial(build, config, (plane, tiles), machine)
     return [Phase("learning to walk", make, config.steps)]
 
 
@@ -74,8 +74,8 @@ def check(config: LowTrainConfig) -> None:
     """
     if config.env.terrain != LowLevelConfig.terrain:
         raise ConfigError("'env.terrain' has no effect: robots train on both, see plane_share")
-    check_batch("ppo.batch_size", config.ppo.batch_size)
-    check_batch("ppo.n_steps' times 'n_envs", config.ppo.n_steps * config.n_envs)
+    check_batch("'ppo.batch_size'", config.ppo.batch_size)
+    check_batch("'ppo.n_steps' times 'n_envs'", config.ppo.n_steps * config.n_envs)
     episode_steps(config.env.episode_seconds, config.env.physics.control_dt)
     if 0 < config.calibration.robots < LEAST_ROBOTS:
         raise ConfigError(
@@ -124,12 +124,12 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
         learned = policies.load(out / "uncalibrated")
     robots, done = config.calibration.robots, learned.meta.pop("calibration", None)
     if done is not None and (done["robots"] or not robots):
-        asked = {"robots": robots, "turns": config.calibration.turns}
         for name in ("robots", "turns") if robots else ():
-            if done[name] != asked[name]:
+            asked = getattr(config.calibration, name)
+            if done[name] != asked:
                 raise ConfigError(
                     f"{out / 'policy'} is already calibrated, with 'calibration.{name}' "
-                    f"{done[name]}, not {asked[name]}; python -m tdgc.calibration --low "
+                    f"{done[name]}, not {asked}; python -m tdgc.calibration --low "
                     f"{out / 'uncalibrated'} does it again"
                 )
         return
@@ -158,11 +158,7 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
 
 
 def build(
-    config: LowTrainConfig,
-    env_config: tuple[LowLevelConfig, LowLevelConfig],
-    device: str,
-    timeout: float,
-    link: MakeLink,
+    config: LowTrainConfig, env_config: tuple[LowLevelConfig, LowLevelConfig], machine: Machine
 ) -> tuple[PPO, TaskVecEnv]:
     """Build the learner and its workers."""
     env = TaskVecEnv(
@@ -172,8 +168,8 @@ def build(
         config.seed,
         low_spaces(config.env),
         recover=True,
-        timeout=timeout,
-        link=link,
+        timeout=machine.timeout,
+        link=machine.link,
     )
     ppo = config.ppo
     rate = NoiseScaledRate(ppo.learning_rate, ppo.final_learning_rate, ppo.initial_std)
@@ -192,7 +188,7 @@ def build(
             "log_std_init": float(th.tensor(ppo.initial_std).log()),
         },
         seed=config.seed,
-        device=device,
+        device=machine.device,
     )
     rate.log_std = model.policy.log_std
     return model, env
@@ -214,21 +210,15 @@ def main(arguments: list[str] | None = None) -> int:
             "benchmark": EDITION,
         }
         interruption = Interruption(args.time_limit)
-        run = Run(
-            args.out, config, meta, summarise, interruption, args.worker_timeout,
-            worker_link(args), args.init,
-        )  # fmt: skip
-        if run.train(phases(config, args.device), args.resume):
+        run = Run(args.out, config, meta, summarise, interruption, args.init)
+        if run.train(phases(config, Machine.of(args)), args.resume):
             finish(args.out, config, interruption)
         log = args.out / "log.jsonl"
         if log.exists():
             plots.training_curve(log, args.out / "training.png")
-    except ValueError as error:
+    except (ValueError, WorkerError, OSError) as error:
         print(f"train_low.py: {error}", file=sys.stderr)
-        return 2
-    except (WorkerError, OSError) as error:
-        print(f"train_low.py: {error}", file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, ValueError) else 1
     return 0
 
 

@@ -36,7 +36,7 @@ from tdgc.config import (
     LowTrainConfig,
 )
 from tdgc.files import make_folder
-from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
+from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.jobs import run_jobs
 from tdgc.parallel.worker import WorkerError
@@ -105,6 +105,10 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     return command[up], total[up] / steps
 
 
+def _float32(x: NDArray[np.floating]) -> th.Tensor:
+    return th.from_numpy(x.astype(np.float32))
+
+
 def _network(seed: int) -> nn.Sequential:
     """Network from commands, as ``ResponseModel.scaled`` gives them, to scaled velocity offsets."""
     sizes = (NUM_COMMANDS, *_HIDDEN)
@@ -135,7 +139,7 @@ class ResponseModel:
 
     def scaled(self, command: Array) -> th.Tensor:
         """Commands (n, 15) in the units of the networks: most are within [-1, 1]."""
-        return th.from_numpy(((command - self._zero) / self._unit).astype(np.float32))
+        return _float32((command - self._zero) / self._unit)
 
     def velocities(self, scaled: th.Tensor) -> Array:
         """The first three columns of ``scaled`` (n, 3 or more) in m/s, m/s, rad/s, (n, 3)."""
@@ -157,7 +161,7 @@ class ResponseModel:
         sign = np.array([np.ones(NUM_COMMANDS), _SIGN])[:, None]
         command = (sign * given[~held]).reshape(-1, NUM_COMMANDS)
         lack = (sign[..., :3] * (reached - given[:, :3])[~held]).reshape(-1, 3) / self._unit[:3]
-        x, y = self.scaled(command), th.from_numpy(lack.astype(np.float32))
+        x, y = self.scaled(command), _float32(lack)
         for network in self._networks:
             optimiser = th.optim.AdamW(network.parameters(), lr=2e-3)
             rate = th.optim.lr_scheduler.CosineAnnealingLR(optimiser, _EPOCHS)
@@ -310,10 +314,6 @@ def distil(
     return student, first, last
 
 
-def _float32(x: NDArray[np.floating]) -> th.Tensor:
-    return th.from_numpy(x.astype(np.float32))
-
-
 # ------------------------------------------------------------------ the script
 
 
@@ -386,10 +386,14 @@ def main(arguments: list[str] | None = None) -> int:
         "--low", type=Path, required=True, help="low policy, with or without suffix"
     )
     parser.add_argument("--out", type=Path, required=True, help="where to write the copy")
-    parser.add_argument("--robots", type=int, default=4800, help="number of robots measured (4800)")
+    robots, turns = CalibrationConfig.robots, CalibrationConfig.turns
     parser.add_argument(
-        "--turns", type=int, default=60, help="distillation rounds of 60 control steps each (60)"
+        "--robots", type=int, default=robots, help=f"number of robots measured ({robots})"
     )
+    parser.add_argument(
+        "--turns", type=int, default=turns,
+        help=f"distillation rounds of {_TURN} control steps each ({turns})",
+    )  # fmt: skip
     parser.add_argument(
         "--plane-share", type=float, default=_PLANE_SHARE, metavar="SHARE",
         help=f"share of the robots that are on a plane while distilling ({_PLANE_SHARE})",
@@ -411,21 +415,16 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"tdgc.calibration: {error}", file=sys.stderr)
         return 2
-    workers = args.workers
-    if workers == "auto":
-        workers = auto_workers(_ROBOTS, usable_cores())
+    workers = usable_cores() if args.workers == "auto" else args.workers
     calibration = CalibrationConfig(args.robots, args.turns)
     try:
         student, facts = calibrate(
             low, calibration, workers, args.seed, plane_share=args.plane_share
         )
         policies.save_copy(args.out, low, student.tensors(), {**low.meta, "calibration": facts})
-    except ValueError as error:
+    except (ValueError, WorkerError, OSError) as error:
         print(f"tdgc.calibration: {error}", file=sys.stderr)
-        return 2
-    except (WorkerError, OSError) as error:
-        print(f"tdgc.calibration: {error}", file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, ValueError) else 1
     print(
         f"{facts['walked']:.0f} of {args.robots} robots walked; the fit predicts what commands "
         f"lead to within {facts['error_vx_m_s']:.3f} and {facts['error_vy_m_s']:.3f} m/s and "

@@ -1,7 +1,6 @@
 """Fixtures and hooks shared by several test files."""
 
 import os
-import signal
 from collections.abc import Iterator
 
 import pytest
@@ -13,6 +12,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from stubs import InlineLink, in_this_process
 
 import evaluate
+from tdgc import policies
+from tdgc.learn.run import signals_restored
 from tdgc.show import film
 from tdgc.tasks import leaps
 
@@ -24,13 +25,24 @@ SLOWEST = (
 ORDER = {f"test_{name}.py": place for place, name in enumerate(SLOWEST)}
 
 
+@pytest.fixture(autouse=True, scope="session")
+def sb3_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Let Stable-Baselines3's default logger use this folder, not a new one in /tmp per learner."""
+    os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
+
+
 @pytest.fixture
 def signals() -> Iterator[None]:
     """Restore the handlers of SIGINT and SIGTERM, which training runs replace."""
-    before = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)]
-    yield
-    for number, handler in before:
-        signal.signal(number, handler)
+    with signals_restored():
+        yield
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Let PyTorch use one thread: with networks this small, threads only wait for each other."""
+    with policies.one_thread():
+        yield
 
 
 @pytest.fixture

@@ -314,6 +314,7 @@ def test_jobs_are_done_in_order_and_fail_as_they_do_here(
         list(cluster.run_jobs(die, [0], 1))
 
 
+@pytest.mark.usefixtures("in_process")
 def test_an_evaluation_that_loses_a_node_gives_the_same_table(
     joined: Cluster, tmp_path: Path
 ) -> None:

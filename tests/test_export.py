@@ -5,7 +5,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -156,14 +156,6 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pair = export.load_pair(LOW, random_high(path / "policy", config))
     export.write(pair, path, ["torchscript"])
     return path
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Restore the number of threads, which a script's main changes."""
-    threads = th.get_num_threads()
-    yield
-    th.set_num_threads(threads)
 
 
 # --- the graphs' mathematics --------------------------------------------------------------------
@@ -638,7 +630,7 @@ def test_a_robot_needs_no_part_of_this_package(folder: Path) -> None:
 # --- the command --------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("one_thread")
+@pytest.mark.usefixtures("one_thread")  # the command sets it and leaves it so
 def test_command_writes_checks_and_reports(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

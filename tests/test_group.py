@@ -7,11 +7,14 @@ import pytest
 
 import train_low
 from tdgc.config import ConfigError, LowLevelConfig, LowTrainConfig, PhysicsConfig
+from tdgc.learn.flags import Machine
 from tdgc.parallel.group import TaskGroup
+from tdgc.parallel.worker import ProcessLink
 from tdgc.tasks.low_env import LowLevelTask, make_task
 from tdgc.tasks.low_statistics import summarise
 
 PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4), episode_seconds=0.4)
+MACHINE = Machine("cpu", 1.0, ProcessLink)
 TILES = dataclasses.replace(PLANE, terrain="tiles", families=("stair", "rough"))
 
 
@@ -95,7 +98,7 @@ def test_goes_on_from_its_state() -> None:
 
 def test_a_share_of_each_workers_robots_stays_on_the_plane() -> None:
     config = dataclasses.replace(LowTrainConfig(), plane_share=0.6)
-    (phase,) = train_low.phases(config, "cpu")
+    (phase,) = train_low.phases(config, MACHINE)
     pair = phase.build.args[1]  # type: ignore[attr-defined]
     assert [mdp.terrain for mdp in pair] == ["plane", "tiles"]
     task = make_task(pair, 0.6, 5, seed=0)
@@ -113,4 +116,4 @@ def test_a_share_of_each_workers_robots_stays_on_the_plane() -> None:
 def test_all_robots_on_the_plane_is_refused() -> None:
     config = dataclasses.replace(LowTrainConfig(), plane_share=1.0)
     with pytest.raises(ConfigError, match="'plane_share' must be from 0 to below 1, not 1"):
-        train_low.phases(config, "cpu")
+        train_low.phases(config, MACHINE)

@@ -28,6 +28,8 @@ from tdgc.tasks.teacher import WAY
 
 SEEN, ENVS, STEPS = 5, 4, 16
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 class Lesson(gym.Env):
     """The taught action is half of the previous observation, so learning it takes memory."""
@@ -50,14 +52,6 @@ class Lesson(gym.Env):
 
     def step(self, action):
         return self._observe(), 0.1, False, bool(self.rng.random() < 0.05), {}
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    yield
-    th.set_num_threads(threads)
 
 
 def learner(

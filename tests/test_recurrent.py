@@ -24,14 +24,7 @@ from tdgc.sim.commands import CommandDecoder
 OBS, ACT, HIDDEN = 6, 2, 16
 ENVS, STEPS = 5, 12
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Use one thread, because with networks this small threads only wait for each other."""
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    yield
-    th.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 class MemoryEnv(gym.Env):

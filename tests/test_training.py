@@ -42,7 +42,7 @@ from tdgc.config import (
     with_overrides,
 )
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
-from tdgc.learn.flags import add_arguments, configure
+from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.imitation import TaughtPolicy
 from tdgc.learn.ppo import LinearRate, NoiseScaledRate
 from tdgc.learn.run import Interruption, append_line, drop_rows_after, tensorboard_logger
@@ -271,12 +271,13 @@ def test_the_learning_rate_of_a_rollout_beyond_the_run() -> None:
 
 def test_tensorboard_shows_what_a_resumed_run_wrote_again_once(tmp_path: Path) -> None:
     for begins, rows_of in ((0, {100: 1.0, 200: 2.0, 300: 3.0}), (200, {300: 4.0})):
+        if begins:
+            time.sleep(1.0)  # TensorBoard orders files by the second in their names
         logger = tensorboard_logger(tmp_path, begins)
         for steps, value in rows_of.items():
             logger.record("reward", value)
             logger.dump(steps)
         logger.close()
-        time.sleep(1.0)  # TensorBoard orders files by the second in their names
     shown = EventAccumulator(str(tmp_path)).Reload().Scalars("reward")
     assert [(event.step, event.value) for event in shown] == [(100, 1.0), (200, 2.0), (300, 4.0)]
 
@@ -921,10 +922,10 @@ def test_robots_of_a_run() -> None:
     On the plane, a physics step is as long as a torque is held: 4 per control step.
     """
     config = with_overrides(LowTrainConfig(), ["steps=80"])
-    (phase,) = train_low.phases(config, "cpu")
+    (phase,) = train_low.phases(config, Machine("cpu", 1.0, ProcessLink))
     assert phase.until == 80
-    _, (on_plane, on_tiles), device = phase.build.args  # type: ignore[attr-defined]
-    assert (on_plane.terrain, on_plane.physics.substeps, device) == ("plane", 4, "cpu")
+    _, (on_plane, on_tiles), machine = phase.build.args  # type: ignore[attr-defined]
+    assert (on_plane.terrain, on_plane.physics.substeps, machine.device) == ("plane", 4, "cpu")
     assert on_plane.physics.hold == 1 and on_plane.physics.joint_steps == 4
     assert (on_tiles.terrain, on_tiles.physics) == ("tiles", config.env.physics)
     assert on_tiles.physics.joint_steps == 4
@@ -968,7 +969,8 @@ def test_the_learner_is_given_the_imitation_loss_and_the_exchange(
     ppo = dataclasses.replace(config.ppo, imitation_coef=0.2, memory_exchange=0.3)
     config = dataclasses.replace(config, ppo=ppo)
     low = policies.load(PRETRAINED / "low")
-    model, _ = train_high.build_reinforcement(config, low, "cpu", 1.0, ProcessLink)
+    machine = Machine("cpu", 1.0, ProcessLink)
+    model, _ = train_high.build_reinforcement(config, low, machine)
     assert made["policy"] is TaughtPolicy and made["exchange"].share == 0.3
     assert model.policy.imitation_weight == pytest.approx(0.2 / config.ppo.ent_coef)
 

@@ -22,13 +22,14 @@ from tdgc.parallel.vec import TaskVecEnv, worker_seed
 from tdgc.parallel.worker import ProcessLink, WorkerError
 from tdgc.state import split
 from tdgc.tasks.low_env import LowLevelTask
+from tdgc.tasks.low_observation import low_spaces
 
 CONFIG = LowLevelConfig(episode_seconds=0.5, physics=PhysicsConfig(substeps=4))
 
 
 make_robots = functools.partial(LowLevelTask, CONFIG)
 
-
+ROBOT_SPACES = low_spaces(CONFIG)
 SPACES = (Counter.observation_space, Counter.action_space)
 
 
@@ -43,8 +44,7 @@ def counters() -> Iterator[TaskVecEnv]:
 def test_workers_compute_what_the_tasks_do() -> None:
     """Two workers with two robots each agree bit for bit, also where episodes end."""
     tasks = [make_robots(2, worker_seed(7, k)) for k in range(2)]
-    spaces = tasks[0].observation_space, tasks[0].action_space
-    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
+    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=ROBOT_SPACES)
     observation: Any = env.reset()
     for task in tasks:
         task.restart()
@@ -96,10 +96,7 @@ def test_other_workers_go_on_from_the_states() -> None:
 
     Some of the episodes end within them.
     """
-    probe = make_robots(1, 0)
-    spaces = probe.observation_space, probe.action_space
-    probe.close()
-    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
+    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=ROBOT_SPACES)
     env.reset()
     steps(env, 10)
     env.forget()
@@ -107,7 +104,7 @@ def test_other_workers_go_on_from_the_states() -> None:
     future = steps(env, 20)
     env.close()
     assert sum(sum(done) for *_, done, _ in future) > 0 and "episode" in str(future)
-    other = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
+    other = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=ROBOT_SPACES)
     other.load_state_dicts(states)
     np.testing.assert_array_equal(other.seen(), seen)
     np.testing.assert_array_equal(other.starts(), starts)
@@ -117,10 +114,7 @@ def test_other_workers_go_on_from_the_states() -> None:
 
 def test_states_of_another_configuration_are_refused_in_one_line() -> None:
     """The error comes from a worker and names what differs."""
-    probe = make_robots(1, 0)
-    spaces = probe.observation_space, probe.action_space
-    probe.close()
-    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=spaces)
+    env = TaskVecEnv(make_robots, 4, 2, seed=7, spaces=ROBOT_SPACES)
     states = env.state_dicts()
     states[1]["obs"] = states[1]["obs"][:, :-1]
     with pytest.raises(ValueError, match=r"^the state does not fit the configuration: .*shape"):

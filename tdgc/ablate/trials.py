@@ -9,10 +9,9 @@ import csv
 import io
 import itertools
 import shutil
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -27,6 +26,7 @@ from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError, StoppedError
 from tdgc.files import write_json
+from tdgc.learn.run import signals_restored
 from tdgc.parallel.cores import Workers
 from tdgc.sim.terrain import UNNAMED
 from tdgc.tasks.pairing import load_low
@@ -185,7 +185,7 @@ class Runner:
                 flags += ["--set", setting]
         left = self._seconds_left()
         flags += [] if left is None else ["--time-limit", left]
-        with _own_signals():
+        with signals_restored():
             call(train_high.main, [*flags, "--out", folder])
         budget = _number(read_json(folder / "config.json"), "steps", folder / "config.json")
         meta = policies.load(folder / "policy").meta
@@ -233,17 +233,6 @@ def call(main: Callable[[list[str]], int], flags: Sequence[object]) -> None:
         lines = said.getvalue().replace("\r", "\n").splitlines()
         named = [line.removeprefix(script) for line in lines if line.startswith(script)]
         raise TrialError(named[-1] if named else f"{script}status {status}")
-
-
-@contextlib.contextmanager
-def _own_signals() -> Iterator[None]:
-    """Restore the handlers of SIGINT and SIGTERM afterwards: a training replaces them."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 # ---------------------------------------------------------------------------- policies

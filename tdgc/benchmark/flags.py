@@ -22,7 +22,7 @@ class Groups(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser, out: str) -> Groups:
     """Add the flags that evaluations share; ``out`` is the default results folder.
 
-    Levels and families are None if not given, until ``read`` fills in the defaults, so that a
+    Levels and families are None if not given, until ``resolve`` fills in the defaults, so that a
     script can reject them where they would have no effect.
     """
     titles = "episodes", "policies", "output", "machine"

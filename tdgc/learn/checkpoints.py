@@ -29,7 +29,7 @@ from tdgc.errors import InputError
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and the one before in case that is damaged
-_VERSION = 13  # since the torques of rotors are part of the state
+_VERSION = 13  # to be raised when the state of a run changes: other versions are refused
 #: Tensor names of the recurrent learner's LSTM states in the current episodes.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 

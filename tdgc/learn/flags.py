@@ -2,7 +2,7 @@
 
 import argparse
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch as th
 
@@ -18,8 +18,28 @@ from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connec
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.worker import MakeLink, ProcessLink
 
-_LONGEST = 86400.0  # s, of a worker's silence
+_LONGEST = 86400.0  # s, a day, of a worker's silence; a pipe cannot be waited on for 25 days
 TrainConfig = TypeVar("TrainConfig", LowTrainConfig, HighTrainConfig)
+
+
+class Machine(NamedTuple):
+    """Where a run learns and collects.
+
+    Attributes:
+        device: PyTorch device of the learner.
+        timeout: s, after which a silent worker is restarted.
+        link: how workers are started.
+    """
+
+    device: str
+    timeout: float
+    link: MakeLink
+
+    @classmethod
+    def of(cls, args: argparse.Namespace) -> "Machine":
+        """From the flags; with ``--cluster`` workers are Ray actors, otherwise processes here."""
+        link: MakeLink = ProcessLink if args.cluster is None else ActorLink
+        return cls(args.device, args.worker_timeout, link)
 
 
 def add_arguments(
@@ -131,8 +151,3 @@ def check_device(name: str) -> None:
             th.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"--device {name}: {str(error).splitlines()[0]}") from None
-
-
-def worker_link(args: argparse.Namespace) -> MakeLink:
-    """How workers are started: as local processes, or with ``--cluster`` as Ray actors."""
-    return ProcessLink if args.cluster is None else ActorLink

@@ -17,10 +17,10 @@ def check_batch(name: str, steps: int) -> None:
     """Refuse a batch of one step, because PPO normalises the advantages of each batch.
 
     Raises:
-        ConfigError: ``name`` says what the number of steps is.
+        ConfigError: there is only one; ``name`` is what the message calls ``steps``.
     """
     if steps < 2:
-        raise ConfigError(f"'{name}' must be at least 2, not {steps}")
+        raise ConfigError(f"{name} must be at least 2, not {steps}")
 
 
 def shared_keywords(ppo: PPOConfig | RecurrentPPOConfig) -> dict[str, Any]:

@@ -6,6 +6,7 @@ files, ``policy.safetensors`` with ``policy.json`` (the latest policy, ready for
 episodes, as if it had never stopped.
 """
 
+import contextlib
 import dataclasses
 import errno
 import json
@@ -14,7 +15,7 @@ import os
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -32,7 +33,7 @@ from tdgc.config import HighTrainConfig, LowTrainConfig, to_dict
 from tdgc.files import write_json, write_text
 from tdgc.learn.checkpoints import Checkpoint
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
-from tdgc.parallel.worker import MakeLink, WorkerError, memory_mb
+from tdgc.parallel.worker import WorkerError, memory_mb
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,14 @@ class Phase:
 
     Attributes:
         name: for the progress bar and the policy that the phase leaves.
-        build: makes the learner and its workers, given the workers' timeout in s and their link.
+        build: makes the learner and its workers.
         until: steps of the run at which the phase ends.
         own_levels: whether robots begin on the levels that the phase's environment sets; otherwise
             they stay on the levels where the previous phase left them.
     """
 
     name: str
-    build: Callable[[float, MakeLink], tuple[Any, TaskVecEnv]]
+    build: Callable[[], tuple[Any, TaskVecEnv]]
     until: int
     own_levels: bool = False
 
@@ -81,6 +82,17 @@ class Interruption:
         tqdm.write(f"stopped by {self.reason}; continue with --resume --out {run}")
 
 
+@contextlib.contextmanager
+def signals_restored() -> Iterator[None]:
+    """Restore at the end the handlers of SIGINT and SIGTERM: an ``Interruption`` replaces them."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 @dataclass(frozen=True)
 class Run:
     """A run of a trainer.
@@ -91,8 +103,6 @@ class Run:
         meta: stored in the policy's file.
         summarise: sums of all workers -> values to log.
         interruption: when to stop.
-        worker_timeout: s, after which a silent worker is restarted.
-        link: how workers are started.
         init: a policy to begin from, if any.
     """
 
@@ -101,8 +111,6 @@ class Run:
     meta: dict[str, Any]
     summarise: Callable[[dict[str, float]], dict[str, float]]
     interruption: Interruption
-    worker_timeout: float
-    link: MakeLink
     init: Path | None = None
 
     def train(self, phases: Sequence[Phase], resume: bool) -> bool:
@@ -121,15 +129,10 @@ class Run:
         if self.init is not None:
             policies.load(self.init)  # fail before anything is written
         self.folder.mkdir(parents=True, exist_ok=True)
-        unsaved: OSError | None = None
+        finished, unsaved = True, None
         for phase in phases:
-            if last is not None and last.steps >= phase.until:
-                continue
-            last, finished, unsaved = self._go_through(phase, last)
-            if not finished:
-                break
-        else:
-            finished = True
+            if finished and (last is None or last.steps < phase.until):
+                last, finished, unsaved = self._go_through(phase, last)
         if unsaved is not None:
             raise unsaved
         if not finished:
@@ -145,7 +148,7 @@ class Run:
             The checkpoint at its end; whether the phase finished; and the error if that checkpoint
             could not be written.
         """
-        model, env = phase.build(self.worker_timeout, self.link)
+        model, env = phase.build()
         try:
             begins = 0 if last is None else last.steps
             model.set_logger(tensorboard_logger(self.folder / "tensorboard", begins))
@@ -262,27 +265,18 @@ class RunCallback(BaseCallback):
         states = self.env.state_dicts()
         extra = {"workers": states, "seconds": self.seconds, "phase": self._name}
         taken = Checkpoint.take(self.model, extra)
+        policy = cast(ActorCriticPolicy, self.model.policy)
+        meta = {**self.run.meta, "steps": taken.steps, "seconds": round(self.seconds)}
         try:
             # The policy first: if it is not finite, it is refused, and so is the checkpoint.
             for name in names:
-                self.save_policy(name)
+                policies.save(self.run.folder / name, policy, meta)
             taken.save(self.run.folder / "checkpoints")
             self.unsaved = None
         except OSError as error:
             self.unsaved = error
             tqdm.write(f"no checkpoint at {taken.steps} steps, the one before stays: {error}")
         return taken
-
-    def save_policy(self, name: str) -> None:
-        """Write the current policy as ``name`` in the run folder.
-
-        Raises:
-            ValueError: it is not finite.
-            OSError: it cannot be written.
-        """
-        progress = {"steps": self.model.num_timesteps, "seconds": round(self.seconds)}
-        policy = cast(ActorCriticPolicy, self.model.policy)
-        policies.save(self.run.folder / name, policy, {**self.run.meta, **progress})
 
     def log(self) -> None:
         """Write a log row about the steps since the last row, if there are any."""
@@ -295,11 +289,10 @@ class RunCallback(BaseCallback):
                 sums[key] = sums.get(key, 0.0) + value
         values = self.run.summarise(sums)
         values["time/steps_per_s"] = (self.num_timesteps - steps) / (self.seconds - seconds)
-        lengths = [e["l"] for e in self.model.ep_info_buffer or ()]
-        if lengths:
-            returns = [e["r"] for e in self.model.ep_info_buffer or ()]
-            values["episode/return"] = float(np.mean(returns))
-            values["episode/length"] = float(np.mean(lengths))
+        episodes = self.model.ep_info_buffer or ()
+        if episodes:
+            values["episode/return"] = float(np.mean([e["r"] for e in episodes]))
+            values["episode/length"] = float(np.mean([e["l"] for e in episodes]))
         for name in (
             "imitation_loss", "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction",
             "std", "learning_rate",
@@ -313,7 +306,7 @@ class RunCallback(BaseCallback):
         values["faults/blow_ups"] = sums.get("blow_ups", 0.0)
         values["faults/restarts"] = float(len(self._faults))
         row: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self.seconds, 1)}
-        row |= {k: _short(v) for k, v in values.items()} | {"faults": self._faults}
+        row |= {k: float(f"{v:.5g}") for k, v in values.items()} | {"faults": self._faults}
         try:
             append_line(self.run.folder / "log.jsonl", json.dumps(row))
             self._faults = []
@@ -331,10 +324,6 @@ class RunCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._bar.close()
-
-
-def _short(value: float) -> float:
-    return float(f"{value:.5g}")
 
 
 def append_line(path: Path, line: str) -> None:

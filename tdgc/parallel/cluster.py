@@ -17,12 +17,13 @@ import time
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.errors import InputError, require
+from tdgc.parallel.jobs import Job, Result
 from tdgc.parallel.worker import BLAS_THREADS, Arrays, Beginning, Worker, WorkerError, keep_memory
 from tdgc.state import copies
 
@@ -38,9 +39,6 @@ CLUSTER_HELP = (
     "simulate on this Ray cluster: host:port, or auto for the one in RAY_ADDRESS, or else the one "
     "on this machine"
 )
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
 
 
 class ClusterError(InputError):
@@ -130,21 +128,13 @@ def _check_nodes() -> None:
             for path in root.glob(pattern)
         }
 
-    here = sums()
-    for name, answer in [
-        (
-            node["NodeManagerAddress"],
-            ray.remote(sums)
-            .options(
-                num_cpus=0,
-                max_retries=0,
-                scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False),
-            )
-            .remote(),
-        )
-        for node in ray.nodes()
-        if node["Alive"]
-    ]:
+    here, asked = sums(), []
+    for node in ray.nodes():
+        if node["Alive"]:
+            there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            ask = ray.remote(sums).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
+            asked.append((node["NodeManagerAddress"], ask.remote()))
+    for name, answer in asked:
         try:
             found = ray.get(answer, timeout=_JOIN_SECONDS)
         except ImportError:
@@ -190,16 +180,11 @@ def _ended(views: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
 
 
 class ActorLink:
-    """A worker in a Ray actor, on whichever node has a free CPU.
+    """A worker in a Ray actor, on whichever node has a free CPU; arguments as in ``MakeLink``.
 
     Each message carries the arrays of all of the worker's robots. Ray's own restarts are off: a
     lost worker raises ``WorkerError``, so that the owner of the link can start another one. Only a
     worker lost before its first answer is restarted here.
-
-    Args:
-        worker: its number.
-        arrays: of all robots.
-        beginning: what it starts from.
     """
 
     def __init__(self, worker: int, arrays: Arrays, beginning: Beginning) -> None:

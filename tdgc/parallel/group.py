@@ -23,8 +23,6 @@ class TaskGroup:
 
     def __init__(self, tasks: Sequence[Task]) -> None:
         self.tasks = list(tasks)
-        self.observation_space = tasks[0].observation_space
-        self.action_space = tasks[0].action_space
         bounds = [0, *itertools.accumulate(task.num_robots for task in tasks)]
         self.num_robots = bounds[-1]
         self._rows = [slice(*ends) for ends in itertools.pairwise(bounds)]

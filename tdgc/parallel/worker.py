@@ -26,7 +26,6 @@ from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,8 +45,6 @@ class Task(Protocol):
     """
 
     num_robots: int
-    observation_space: "gym.spaces.Box[Any]"
-    action_space: "gym.spaces.Box[Any]"
 
     def reset(self, index: NDArray[np.integer]) -> None: ...
 
@@ -349,13 +346,7 @@ def _without_script(needed: Any) -> Iterator[None]:
 
 
 class ProcessLink:
-    """A worker in a process on this machine.
-
-    Args:
-        worker: its number.
-        arrays: of all robots.
-        beginning: what it starts from.
-    """
+    """A worker in a process on this machine; arguments as in ``MakeLink``."""
 
     def __init__(self, worker: int, arrays: Arrays, beginning: Beginning) -> None:
         context = mp.get_context("spawn")
