@@ -27,7 +27,7 @@ ORDER = {f"test_{name}.py": place for place, name in enumerate(SLOWEST)}
 
 @pytest.fixture(autouse=True, scope="session")
 def sb3_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Let Stable-Baselines3's default logger use this folder, not a new one in /tmp per learner."""
+    """Let Stable-Baselines3's default logger use one folder, not a new one in /tmp per learner."""
     os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
 
 
@@ -47,7 +47,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let evaluate.py run its jobs in this process."""
+    """Let evaluate.py run its jobs, and draw its films, in this process."""
     monkeypatch.setattr(evaluate, "run_jobs", in_this_process)
     monkeypatch.setattr(film, "run_jobs", in_this_process)
 

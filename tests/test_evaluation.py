@@ -638,7 +638,10 @@ def test_a_condition_reaches_the_robots(name, friction, payload, delay, armature
     for body, client in zip(world._bodies, world._client_of, strict=True):
         mass, mu, *_ = client.getDynamicsInfo(body, -1)
         assert (mass, mu) == pytest.approx((world.state.geometry.trunk_mass + payload, friction))
-    assert world.armature.tolist() == [armature] * 2
+        inertia = client.getDynamicsInfo(body, -1)[2]
+        share = mass / world.state.geometry.trunk_mass  # the payload is spread over the trunk
+        # The rotors of the hips turn about the trunk's longitudinal axis.
+        assert inertia[0] == pytest.approx(share * 0.016147 + 4.0 * armature)
     assert batch.loco.delay.tolist() == [delay] * 2
     assert world.strength[:, 0].tolist() == [motor] * 2
     world.close()

@@ -69,7 +69,7 @@ HIGH = (
 )
 ONE = "--episodes 1 --workers 1"
 FALL = f"--policies gp --families gap --levels 10 {ONE}"  # into the first trench, within seconds
-CLUMSY = "--low runs/low/policy"  # trained for 128 steps: off its tile within two seconds
+CLUMSY = "--low runs/low/policy"  # hardly trained: its episodes end within seconds
 #: Commands that are run, in order: some need what those before them leave.
 RUNS: dict[str, Run] = {
     "python train_low.py": Run(

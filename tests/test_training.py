@@ -539,7 +539,6 @@ def test_the_manner_of_the_teacher(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert manner(alone, tmp_path / "high") == TeacherConfig(leap_speed=1.0)
 
 
-@pytest.mark.usefixtures("inline_workers")
 def test_from_scratch_on_terrain_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

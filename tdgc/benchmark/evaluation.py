@@ -128,7 +128,7 @@ class EpisodeRecord:
 
     @property
     def where(self) -> str:
-        """Tile and condition, as text for people."""
+        """Tile and condition, as readable text."""
         return f"{self.family}, level {self.level}, {self.condition}, episode {self.episode}"
 
     def tile(self) -> Tile:
@@ -383,7 +383,10 @@ def run_cell(
 def closed_loop(
     driver: Driver, executor: Carries, batch: Batch, watchers: Sequence[Watcher]
 ) -> list[Episode]:
-    """Run the paper's closed loop (Sec. IV) until every episode of a batch has ended."""
+    """Run the paper's closed loop (Sec. IV) until every episode of a batch has ended.
+
+    Driver and watchers begin first. Returns one episode per robot, in order.
+    """
     driver.begin(batch.loco, batch.goal, batch.told, batch.probes)
     for watcher in watchers:
         watcher.begin(batch)

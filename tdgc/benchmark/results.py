@@ -28,7 +28,7 @@ PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
 # ``cues`` is what learning adds to the cues.
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
 
-_Where = tuple[str, str, int, int]
+_Where = tuple[str, str, int, int]  # policy or condition, family, level, episode
 
 
 def make_room(out: Path, patterns: Sequence[str], folders: Mapping[str, bool]) -> None:
@@ -80,7 +80,8 @@ def _reached(episodes: Iterable[Episode], of: str, side: str) -> dict[_Where, di
 def _differences_of(
     reached: dict[_Where, dict[str, bool]], first: str, second: str
 ) -> dict[str, Any]:
-    """``difference`` of two sides, where there are both: key -> family -> that, with "mean"."""
+    """``difference`` of two sides, where there are both: key -> family -> that, with "mean"
+    over the families."""
     tree: dict[str, Any] = {}
     for (key, family, *_), found in reached.items():
         if first in found and second in found:

@@ -137,15 +137,17 @@ def _open_onnx(path: Path, table: Table) -> Run:
     # The session is bound to these arrays, since naming and wrapping new ones takes a sixth of a
     # step.
     binding = session.io_binding()
-    given, made = ([np.zeros(s["shape"]) for s in table[side]] for side in ("inputs", "outputs"))
+    given: list[Array] = []
+    made: list[Array] = []
     for side, found, arrays, bind in (
         ("inputs", session.get_inputs(), given, binding.bind_ortvalue_input),
         ("outputs", session.get_outputs(), made, binding.bind_ortvalue_output),
     ):
         if [(s["name"], s["shape"]) for s in table[side]] != [(x.name, x.shape) for x in found]:
             raise ExportError(f"{path}: its {side} are not those of its interface file")
-        for signal, array in zip(table[side], arrays, strict=True):
-            bind(signal["name"], onnxruntime.OrtValue.ortvalue_from_numpy(array))
+        for signal in table[side]:
+            arrays.append(np.zeros(signal["shape"]))
+            bind(signal["name"], onnxruntime.OrtValue.ortvalue_from_numpy(arrays[-1]))
 
     def run(values: list[Array]) -> list[Array]:
         for array, value in zip(given, values, strict=True):
@@ -315,7 +317,7 @@ class Controller:
         for name in due:
             self._graphs[name].check(readings)
         readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
-        self.decided, self.seconds = "high" in due, 0.0
+        self.decided, self.seconds = False, 0.0
         for name in due:
             graph = self._graphs[name]
             taken = {
@@ -327,6 +329,7 @@ class Controller:
                 taken["commands"] = self._stand
             graph(readings | taken)
             self.seconds += graph.seconds
+            self.decided |= name == "high"
         self.commands = self.low.values["commands"]
         self.count += 1
         return self.low.values["joint_targets"]

@@ -18,7 +18,7 @@ from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connec
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.worker import MakeLink, ProcessLink
 
-_LONGEST = 86400.0  # s, a day, of a worker's silence; a pipe cannot be waited on for 25 days
+_LONGEST = 86400.0  # s, of a worker's silence: one day; waiting on a pipe overflows at 25 days
 TrainConfig = TypeVar("TrainConfig", LowTrainConfig, HighTrainConfig)
 
 

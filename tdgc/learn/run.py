@@ -84,7 +84,7 @@ class Interruption:
 
 @contextlib.contextmanager
 def signals_restored() -> Iterator[None]:
-    """Restore at the end the handlers of SIGINT and SIGTERM: an ``Interruption`` replaces them."""
+    """Restore the handlers of SIGINT and SIGTERM at the end; an ``Interruption`` replaces them."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield

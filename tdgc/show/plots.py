@@ -53,7 +53,7 @@ def _save(figure: Figure, out: Path) -> None:
 
 def _caption(figure: Figure, text: str) -> None:
     """Add a caption below the panels, wrapped to the figure's width."""
-    # Letters of 9 points are half as wide as tall: 16 an inch, less a margin.
+    # Letters of 9 points are half as wide as tall: 16 to the inch, less a margin.
     letters = int(14 * figure.get_size_inches()[0])
     figure.supxlabel(textwrap.fill(text, letters), fontsize=9)
 

@@ -148,7 +148,8 @@ def film_stem(row: Row) -> str:
 
 def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> dict[str, Any]:
     """Describe an episode: its rows of episodes.csv and diagnosis.csv, the name of its film in
-    ``folder``, and film and sheet as data URIs; the film's only if it fits in ``room`` bytes."""
+    ``folder``, and film and sheet as data URIs, the film's only if it fits in ``room`` bytes;
+    None for what is missing."""
     stem = film_stem(row)
     kinds = (folder / f"film_{stem}.mp4", folder / f"film_{stem}.gif")
     path = next((path for path in kinds if path.is_file()), None)

@@ -71,7 +71,7 @@ class MujocoWorld(World):
     """One robot on the only tile of a field, simulated by MuJoCo instead of Bullet.
 
     It supports what an episode needs of a ``World``, but not changing the terrain, ``forget``,
-    ``picture`` and ``joint_friction``: dry friction is that of the settings. ``armature`` is added
+    ``picture`` or ``joint_friction``: dry friction is that of the settings. ``armature`` is added
     to that of the settings.
 
     Args:

@@ -29,7 +29,7 @@ from tdgc.errors import InputError
 FloatArray = NDArray[np.float64]
 HeightArray = NDArray[np.float32]
 
-#: Edition of TDGC-Bench that these tiles belong to, whose layouts are drawn for each tile.
+#: Edition of TDGC-Bench that these tiles belong to; it draws a layout for every tile.
 EDITION = 2
 
 # Families and levels: Sec. III-A. Mixed and the levels above 10 are for evaluation only.
@@ -622,7 +622,7 @@ class TileField:
 
     @classmethod
     def of(cls, tile: Tile) -> "TileField":
-        """A field of this one tile, whose heights cannot be changed, which makes worlds faster."""
+        """A field of one tile; its heights are read-only, which makes worlds faster."""
         field = cls((1, 1))
         field.place(0, 0, tile)
         field.heights.setflags(write=False)

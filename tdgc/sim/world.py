@@ -339,8 +339,8 @@ class World:
         """Make Bullet forget the contacts of earlier steps; ``state`` stays as it is.
 
         Bullet warm-starts its solver with the last step's contact forces. After this call the
-        simulation continues, bit for bit, as in a world rebuilt with the same ``state``, strength
-        and dynamics. To this end every robot spends one ``stepSimulation`` high above the ground.
+        simulation continues, bit for bit, as in a world rebuilt with the same ``state`` and
+        dynamics. To this end every robot spends one ``stepSimulation`` high above the ground.
         """
         for i in self._active:
             self._place_trunk(int(i), self.state.position[i] + [0.0, 0.0, _PARKED])

@@ -139,8 +139,7 @@ class Crossings:
         values[leaps, swing] = rng.uniform(low, highest, int(leaps.sum()))
         for j, usual in (
             (INDEX["duration"], DURATION),  # that landings are planned for
-            # Until the first landing is planned.
-            *zip(STRIDE_COMMANDS, (SPEED / STRIDE, STRIDE), strict=True),
+            *zip(STRIDE_COMMANDS, (SPEED / STRIDE, STRIDE), strict=True),  # until one is planned
         ):
             values[leaps, j] = np.clip(usual, self._low[j], self._high[j])
         e.leaping[index] = leaps

@@ -44,9 +44,10 @@ def check_rules(window: int, threshold: int, max_level: int) -> None:
 def update_level(
     level: ArrayLike, successes: ArrayLike, window: int, threshold: int, max_level: int
 ) -> Ints:
-    """Levels after the two rules of Sec. IV-C, for full windows with so many ``successes``.
+    """Levels after the two rules of Sec. IV-C, for full windows that hold ``successes`` successes.
 
-    ``level`` and ``successes`` have the same shape; the levels are in 0..max_level - 1.
+    ``level``, in 0..max_level - 1, and ``successes`` have the same shape. ``window`` is W episodes,
+    ``threshold`` is S, and ``max_level`` is L_max, the number of levels.
 
     Raises:
         ValueError: invalid rules, see ``check_rules``.

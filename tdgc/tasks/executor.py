@@ -43,6 +43,7 @@ class Executor:
         self._actions = np.zeros((loco.num_robots, NUM_JOINTS), dtype=np.float32)
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
+        """As ``Carries.step``: observe, ask the low policy, act."""
         self.loco.command[:] = commands
         seen = self.loco.observe(self._noise)
         rows = np.arange(len(seen)) if rows is None else rows

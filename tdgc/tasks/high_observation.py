@@ -47,7 +47,7 @@ SEMANTIC = (*FAMILIES, "unknown")
 
 
 def semantic_index(family: str) -> int:
-    """Index into ``SEMANTIC``: that of "unknown" for any other family."""
+    """Index of a family in ``SEMANTIC``; that of "unknown" if it is not listed."""
     return SEMANTIC.index(family if family in SEMANTIC else "unknown")
 
 
