@@ -30,6 +30,18 @@ def atomic(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def write_synced(path: Path, data: bytes) -> None:
+    """Write a file and wait until it is on the disk, so that a rename never outlives its content.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with open(path, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically, in UTF-8.
 

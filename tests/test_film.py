@@ -26,6 +26,8 @@ from tdgc.sim.gaits import gait_embedding
 from tdgc.sim.robot import Array, nominal_pose
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 
 def planted(steps: int = 25, policy: str = "gp", **changes: Any) -> Recording:
     """A recording of ``steps`` steps: a robot glides along a tile with its legs still."""
@@ -291,11 +293,6 @@ def test_a_sheet_has_the_bars_that_were_planted(tmp_path: Path) -> None:
 
 
 # ------------------------------------------------------------------ the script
-
-
-@pytest.fixture(autouse=True)
-def evaluations_in_process(in_process: None) -> None:
-    """Let evaluate.py run its jobs in this process, in all tests of this file."""
 
 
 def evaluate_short(out: Path, monkeypatch: pytest.MonkeyPatch, *flags: str) -> int:

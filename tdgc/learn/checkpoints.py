@@ -26,6 +26,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from tdgc import __version__
 from tdgc.errors import InputError
+from tdgc.files import write_synced
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and the one before in case that is damaged
@@ -138,10 +139,7 @@ class Checkpoint:
         partial.mkdir(parents=True)
         try:
             for name, content in (("state.safetensors", data), ("state.json", text.encode())):
-                with open(partial / name, "wb") as file:
-                    file.write(content)
-                    file.flush()
-                    os.fsync(file.fileno())
+                write_synced(partial / name, content)
             shutil.rmtree(final, ignore_errors=True)
             os.replace(partial, final)
         except OSError:

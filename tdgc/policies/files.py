@@ -42,7 +42,7 @@ import torch as th
 from torch import nn
 
 from tdgc.errors import InputError
-from tdgc.files import atomic
+from tdgc.files import atomic, write_synced
 
 FORMAT = "tdgc-policy"
 VERSION = 1
@@ -342,8 +342,9 @@ def store(path: str | os.PathLike[str], header: Header, tensors: dict[str, th.Te
     Header.from_json(text.decode())  # write nothing that cannot be read back
     header_path, weights_path = files_of(path)
     header_path.parent.mkdir(parents=True, exist_ok=True)
-    _write(weights_path, weights)
-    _write(header_path, text)
+    for file, data in ((weights_path, weights), (header_path, text)):
+        with atomic(file) as partial:
+            write_synced(partial, data)
 
 
 def files_of(path: str | os.PathLike[str]) -> tuple[Path, Path]:
@@ -353,13 +354,6 @@ def files_of(path: str | os.PathLike[str]) -> tuple[Path, Path]:
     name = path.stem if path.suffix in (".safetensors", ".json") else path.name
     # Not Path.with_suffix, which would drop the ".5" of "low-v1.5".
     return path.parent / f"{name}.json", path.parent / f"{name}.safetensors"
-
-
-def _write(path: Path, data: bytes) -> None:
-    with atomic(path) as partial, open(partial, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
