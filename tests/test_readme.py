@@ -118,7 +118,7 @@ RUNS: dict[str, Run] = {
         HIGH, ("runs/hills/policy.safetensors",)
     ),
     ".venv/bin/python evaluate.py --families stair,gap --levels 6 --episodes 1 "
-    "--policies tdgc --video": Run(FALL, ("runs/evaluation/report.html",)),
+    "--policies tdgc --video": Run(f"{FALL} {CLUMSY}", ("runs/evaluation/report.html",)),
     "python evaluate.py --video --families stair,gap --levels 8": Run(
         f"{FALL} {CLUMSY}",
         (
@@ -162,7 +162,6 @@ RUNS: dict[str, Run] = {
 }
 #: Commands that take long, or need a display or a cluster: only their flags are parsed.
 READ = (
-    "python evaluate.py --tracking",
     "python evaluate.py --gui",
     "python evaluate.py --gui watch --families stair --levels 6",
     "python train_high.py --preset paper --out runs/paper",
@@ -256,6 +255,8 @@ def test_commands_run(
     workspace: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(workspace)
+    for length in ("_TRACKING_SECONDS", "_FALL_SECONDS"):
+        monkeypatch.setattr(f"tdgc.benchmark.tracking.{length}", 2.0)
     for name, text in TEXT.items():
         for code in blocks(text, "python"):
             exec(compile(code, name, "exec"), {})  # some write a robot or a terrain
