@@ -41,6 +41,7 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
+from tdgc.files import sole_user
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.imitation import TaughtPolicy
@@ -733,6 +734,9 @@ def test_flags_and_folders_that_cannot_be_used(
         error = capsys.readouterr().err
         assert error.startswith("train_low.py: ") and message in error
         assert error.count("\n") == 1
+    with sole_user(used):
+        assert train_low.main(["--resume", "--out", str(used)]) == 2
+    assert capsys.readouterr().err == f"train_low.py: '{used}' is in use by another process\n"
     for setting, message in (
         ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
         ("env.first_level=3", "'env.first_level' and 'env.first_levels' have no effect with imi"),

@@ -30,7 +30,7 @@ from tqdm import tqdm
 
 from tdgc import policies
 from tdgc.config import HighTrainConfig, LowTrainConfig, to_dict
-from tdgc.files import write_json, write_text
+from tdgc.files import sole_user, write_json, write_text
 from tdgc.learn.checkpoints import Checkpoint
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import WorkerError, memory_mb
@@ -120,19 +120,21 @@ class Run:
             Whether the run finished; False if it was interrupted.
 
         Raises:
+            InputError: another process trains in the same folder.
             CheckpointError: there is no readable checkpoint to resume from, or it does not fit.
             ValueError: the policy ``init`` cannot be read or does not fit.
             WorkerError: too many worker faults; a checkpoint was written.
             OSError: a file cannot be written, for example the last checkpoint.
         """
-        last = Checkpoint.newest(self.folder, tqdm.write) if resume else None
         if self.init is not None:
             policies.load(self.init)  # fail before anything is written
         self.folder.mkdir(parents=True, exist_ok=True)
         finished, unsaved = True, None
-        for phase in phases:
-            if finished and (last is None or last.steps < phase.until):
-                last, finished, unsaved = self._go_through(phase, last)
+        with sole_user(self.folder):
+            last = Checkpoint.newest(self.folder, tqdm.write) if resume else None
+            for phase in phases:
+                if finished and (last is None or last.steps < phase.until):
+                    last, finished, unsaved = self._go_through(phase, last)
         if unsaved is not None:
             raise unsaved
         if not finished:
