@@ -211,8 +211,8 @@ def main(arguments: list[str] | None = None) -> int:
         }
         interruption = Interruption(args.time_limit)
         run = Run(args.out, config, meta, summarise, interruption, args.init)
-        if run.train(phases(config, Machine.of(args)), args.resume):
-            finish(args.out, config, interruption)
+        calibrating = functools.partial(finish, args.out, config, interruption)
+        run.train(phases(config, Machine.of(args)), args.resume, calibrating)
         log = args.out / "log.jsonl"
         if log.exists():
             plots.training_curve(log, args.out / "training.png")

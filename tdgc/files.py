@@ -1,7 +1,6 @@
-"""Atomic file writes, checksums, and folders that are writable or in use."""
+"""Atomic file writes, checksums, and writable folders."""
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import os
@@ -9,8 +8,6 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-
-from tdgc.errors import InputError
 
 
 @contextlib.contextmanager
@@ -72,26 +69,6 @@ def make_folder(folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=folder).close()
-
-
-@contextlib.contextmanager
-def sole_user(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a folder that they ask for in the same way.
-
-    However the process ends, its folder is then free again.
-
-    Raises:
-        InputError: another process uses the folder.
-        OSError: the folder cannot be written to.
-    """
-    with open(folder / ".lock", "wb") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"'{folder}' is in use by another process") from None
-        except OSError:
-            pass  # a file system without locks: better unguarded than unusable
-        yield
 
 
 def checksum(path: Path) -> str:

@@ -41,7 +41,6 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.files import sole_user
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.imitation import TaughtPolicy
@@ -583,7 +582,10 @@ def test_from_scratch_on_terrain_of_ones_own(
 def test_calibration_ends_a_run_of_the_low_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The calibrated copy replaces the policy; an interrupted run ends the same once resumed."""
+    """The calibrated copy replaces the policy; an interrupted run ends the same once resumed.
+
+    While it calibrates, as all the time, a run cannot be resumed a second time.
+    """
     monkeypatch.setattr(calibration, "_EPOCHS", 2)
     monkeypatch.setattr(calibration, "_CORRECTIONS", 4)
     monkeypatch.setattr(calibration, "_ROBOTS", 12)
@@ -599,13 +601,19 @@ def test_calibration_ends_a_run_of_the_low_policy(
     assert given.meta["benchmark"] == learned.meta["benchmark"] == 2
     assert weights(whole) != (whole / "uncalibrated.safetensors").read_bytes()
 
+    second: list[int] = []
+
     def stop(call: int, interruption: Interruption) -> None:
-        interruption.reason = "the test" if call == 4 else None
+        if call == 4:
+            second.append(train_low.main(["--resume", "--out", str(broken)]))
+            interruption.reason = "the test"
 
     with monkeypatch.context() as patch:
         at_calls(patch, stop)
         assert train_low.main([*arguments, "--out", str(broken)]) == 0
-    assert "stopped by the test" in "".join(capfd.readouterr())
+    said = "".join(capfd.readouterr())
+    assert second == [2] and f"'{broken}' is in use by another process\n" in said
+    assert "stopped by the test" in said
     assert weights(broken) == (whole / "uncalibrated.safetensors").read_bytes()
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
     assert weights(broken) == weights(whole)
@@ -734,9 +742,6 @@ def test_flags_and_folders_that_cannot_be_used(
         error = capsys.readouterr().err
         assert error.startswith("train_low.py: ") and message in error
         assert error.count("\n") == 1
-    with sole_user(used):
-        assert train_low.main(["--resume", "--out", str(used)]) == 2
-    assert capsys.readouterr().err == f"train_low.py: '{used}' is in use by another process\n"
     for setting, message in (
         ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
         ("env.first_level=3", "'env.first_level' and 'env.first_levels' have no effect with imi"),

@@ -1,7 +1,7 @@
 """A training run: its folder, its phases, the learning loop, logs and interruption.
 
 A run folder holds ``config.json``, ``log.jsonl`` (a row every ``log_steps``), TensorBoard's event
-files, ``policy.safetensors`` with ``policy.json`` (the latest policy, ready for use) and
+files, ``policy.safetensors`` with ``policy.json`` (the latest policy, ready for use), ``.lock`` and
 ``checkpoints/`` with the two newest checkpoints, from which a run resumes, in the middle of its
 episodes, as if it had never stopped.
 """
@@ -9,6 +9,7 @@ episodes, as if it had never stopped.
 import contextlib
 import dataclasses
 import errno
+import fcntl
 import json
 import math
 import os
@@ -30,7 +31,8 @@ from tqdm import tqdm
 
 from tdgc import policies
 from tdgc.config import HighTrainConfig, LowTrainConfig, to_dict
-from tdgc.files import sole_user, write_json, write_text
+from tdgc.errors import InputError
+from tdgc.files import write_json, write_text
 from tdgc.learn.checkpoints import Checkpoint
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import WorkerError, memory_mb
@@ -113,18 +115,21 @@ class Run:
     interruption: Interruption
     init: Path | None = None
 
-    def train(self, phases: Sequence[Phase], resume: bool) -> bool:
+    def train(
+        self, phases: Sequence[Phase], resume: bool, finish: Callable[[], None] = lambda: None
+    ) -> None:
         """Run the phases in order, starting from the newest checkpoint if ``resume`` is set.
 
-        Returns:
-            Whether the run finished; False if it was interrupted.
+        ``finish`` is called at the end, unless the run was interrupted. Until then no other process
+        can train in the folder.
 
         Raises:
-            InputError: another process trains in the same folder.
+            InputError: another process trains in the folder.
             CheckpointError: there is no readable checkpoint to resume from, or it does not fit.
             ValueError: the policy ``init`` cannot be read or does not fit.
             WorkerError: too many worker faults; a checkpoint was written.
             OSError: a file cannot be written, for example the last checkpoint.
+            Exception: what ``finish`` raises.
         """
         if self.init is not None:
             policies.load(self.init)  # fail before anything is written
@@ -135,11 +140,12 @@ class Run:
             for phase in phases:
                 if finished and (last is None or last.steps < phase.until):
                     last, finished, unsaved = self._go_through(phase, last)
-        if unsaved is not None:
-            raise unsaved
-        if not finished:
-            self.interruption.tell(self.folder)
-        return finished
+            if unsaved is not None:
+                raise unsaved
+            if finished:
+                finish()
+            else:
+                self.interruption.tell(self.folder)
 
     def _go_through(
         self, phase: Phase, last: Checkpoint | None
@@ -326,6 +332,27 @@ class RunCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._bar.close()
+
+
+@contextlib.contextmanager
+def sole_user(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a run folder that they ask for in the same way.
+
+    The folder is free again when the process ends, even if it is killed; the file ``.lock`` stays.
+    Processes that it has started do not hold the lock.
+
+    Raises:
+        InputError: another process uses the folder, or this one does already.
+        OSError: the folder cannot be written to.
+    """
+    with open(folder / ".lock", "wb") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"'{folder}' is in use by another process") from None
+        except OSError:
+            pass  # a file system without locks: better unguarded than unusable
+        yield
 
 
 def append_line(path: Path, line: str) -> None:
