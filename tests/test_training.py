@@ -584,7 +584,7 @@ def test_calibration_ends_a_run_of_the_low_policy(
 ) -> None:
     """The calibrated copy replaces the policy; an interrupted run ends the same once resumed.
 
-    While it calibrates, as all the time, a run cannot be resumed a second time.
+    A run that still calibrates, like one that still learns, cannot be resumed by someone else.
     """
     monkeypatch.setattr(calibration, "_EPOCHS", 2)
     monkeypatch.setattr(calibration, "_CORRECTIONS", 4)

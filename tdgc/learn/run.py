@@ -336,7 +336,7 @@ class RunCallback(BaseCallback):
 
 @contextlib.contextmanager
 def sole_user(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a run folder that they ask for in the same way.
+    """Hold a run folder, so that nobody else who asks for it here can train in it.
 
     The folder is free again when the process ends, even if it is killed; the file ``.lock`` stays.
     Processes that it has started do not hold the lock.
