@@ -147,6 +147,11 @@ class Evaluation:
         self._check_mode()
         if self.tuning is not None and "tdgc" not in self.policies:
             raise ValueError("--tune and --set change tdgc, which is not among the policies")
+        if self.mode == "watch" and self.tuning is not None and self.policies[0] != "tdgc":
+            raise ValueError(
+                f"--gui watch shows the first policy, {self.policies[0]}, but --tune and --set "
+                "change tdgc"
+            )
 
     def _check_mode(self) -> None:
         if self.mode in gui.MODES:
@@ -209,9 +214,12 @@ class Evaluation:
             workers=flags.workers,
             out=flags.out,
         )
+        if flags.high is not None and evaluation.policies == ("gp",):
+            raise ValueError("--high has no effect: gp uses no high policy")
         if flags.cluster is None:
             return evaluation
         cores = cluster.connect(flags.cluster)  # only once the evaluation is known to be valid
+        cluster.check_workers(1, cores)
         return replace(evaluation, workers=cores) if automatic else evaluation
 
     @property
@@ -265,8 +273,10 @@ class Evaluation:
         return drivers
 
     def make_room(self) -> None:
-        """Create the results folder; only a table replaces an earlier one there."""
-        if self.mode != "table":
+        """Create the results folder, if there will be any; only a table replaces an earlier one."""
+        if self.mode in gui.MODES:
+            return
+        if self.mode == "tracking":
             make_folder(self.out)
             return
         left = ["traces/*.parquet", "diagnosis.csv", "tuning.json", report.NAME]

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 import train_high
 from tdgc import policies
+from tdgc.ablate import trials
 from tdgc.ablate.__main__ import choose, main, plan, without_missing
 from tdgc.ablate.table import Found, describe, rows
 from tdgc.ablate.trials import Result, Runner, Trial
@@ -221,6 +223,28 @@ def finish(folder: Path) -> None:
     (folder / EPISODES).write_text("family,level,episode,outcome\ntilt,6,0,reached\n")
 
 
+@pytest.mark.parametrize("trained", [True, False])
+def test_the_teacher_leads_as_it_taught_the_full_hierarchy(
+    trained: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It reads from the high policy of ``full`` how it commands the low policy."""
+    asked: list[object] = []
+
+    def evaluated(main: object, flags: list[object]) -> None:
+        asked.extend(flags)
+        shutil.copytree(tmp_path / "of-another" / "evaluation", tmp_path / "teacher" / "evaluation")
+
+    finish(tmp_path / "of-another")
+    if trained:
+        finish(tmp_path / "full-7")
+    monkeypatch.setattr(trials, "call", evaluated)
+    runner = Runner(tmp_path, LOW, False, ('env.families=["tilt"]',), None, "6", 1, 1, None)
+    assert runner.run(Trial(named("teacher"), None)).reached.tolist() == [True]
+    assert ("--high" in asked) == trained
+    if trained:
+        assert asked[asked.index("--high") + 1] == tmp_path / "full-7" / "policy"
+
+
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
@@ -336,6 +360,10 @@ def test_a_table_that_cannot_be_written_is_one_line(
         ("--set env.cue=none", "unknown configuration key 'env.cue'"),
         ('--set env.families=["sand"]', "unknown family 'sand'"),
         ("--low nowhere/low", "nowhere/low.json: no such file"),
+        ("--seeds 3,-1", "'seed' must be"),
+        ("--steps 0", "'steps' must be"),
+        ("--set seed=7", "--set cannot change 'seed' here; use --seeds"),
+        ("--set low=runs/low/policy", "--set cannot change 'low' here; use --low"),
     ],
 )
 def test_flags_that_cannot_be_used(

@@ -8,8 +8,10 @@ import errno
 import hashlib
 import json
 import math
+import os
 import re
 import shutil
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -46,6 +48,7 @@ from tdgc.config import (
     to_dict,
 )
 from tdgc.errors import InputError
+from tdgc.parallel import cluster
 from tdgc.parallel.worker import WorkerError
 from tdgc.show import gui
 from tdgc.sim.commands import default_command
@@ -389,11 +392,28 @@ GUI_CONDITION = "--gui shows the nominal condition: no --conditions"
         (["--workers", "0"], "--workers must be at least 1, not 0"),
         (["--seed", "-1"], "--seed must lie in [0, 2**32), not -1"),
         (["--high", "nowhere/high"], "nowhere/high.json: no such file"),
+        (
+            ["--policies", "gp", "--high", "nowhere/high"],
+            "--high has no effect: gp uses no high policy",
+        ),
+        (["--policies", "all,cues"], "'all' must stand alone, not in 'all,cues'"),
+        (["--families", "all,no.npy"], "'all' must stand alone, not in 'all,no.npy'"),
+        (
+            ["--gui", "watch", "--policies", "gp,tdgc", "--set", "decoder.vx.high=0.6"],
+            "--gui watch shows the first policy, gp, but --tune and --set change tdgc",
+        ),
     ],
 )
 def test_flags_that_cannot_be_used(flags, message, capsys):
     assert evaluate.main(flags) == 2
     assert capsys.readouterr().err == f"evaluate.py: {message}\n"
+
+
+def test_a_cluster_without_cpus_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr(cluster, "connect", lambda address: 0)
+    assert evaluate.main(["--policies", "gp", "--cluster", "auto"]) == 2
+    said = "evaluate.py: the cluster's 0 CPUs are too few for 1 workers\n"
+    assert capsys.readouterr().err == said
 
 
 def test_a_policy_of_the_wrong_kind(high, capsys):
@@ -496,12 +516,16 @@ def test_the_robot_is_read_for_diagnoses_alone(low, monkeypatch):
 RunJobs = Callable[[Callable[[Any], Any], Sequence[Any], int], Iterator[Any]]
 
 
-def stopped(after: int, error: BaseException) -> RunJobs:
-    """A ``run_jobs`` that does the first ``after`` jobs and then raises ``error``."""
+def stopped(after: int, error: BaseException | None) -> RunJobs:
+    """A ``run_jobs`` that does the first ``after`` jobs and then raises ``error``; without one, the
+    process gets a SIGTERM."""
 
     def run_jobs(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:
         yield from map(work, jobs[:after])
-        raise error
+        if error is not None:
+            raise error
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield from map(work, jobs[after:])
 
     return run_jobs
 
@@ -528,10 +552,13 @@ BLOWN = "Cell(...): a robot's position is not finite"
         (FloatingPointError(BLOWN), BLOWN),
         (InputError("terrain 'no.npy' cannot be read"), "terrain 'no.npy' cannot be read"),
         (OSError(errno.ENOSPC, "No space left on device"), "[Errno 28] No space left on device"),
+        (MemoryError(), "MemoryError"),
+        (None, "stopped by SIGTERM"),
     ],
 )
 def test_what_is_complete_is_kept(error, reason, high, tmp_path, monkeypatch, capsys):
     """Stopped before the last batch, an evaluation drops only the last cell, which lacks half."""
+    before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(evaluation, "BATCH", 1)
     monkeypatch.setattr(evaluation, "HORIZON", 0.04)
     monkeypatch.setattr(evaluate, "run_jobs", stopped(7, error))
@@ -550,6 +577,7 @@ def test_what_is_complete_is_kept(error, reason, high, tmp_path, monkeypatch, ca
     assert summary["gp"]["nominal"]["mean"]["n"] == 2 and "gp, nominal" in said.out
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"episodes.csv", "summary.json", "trajectories.npz"}
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_without_a_complete_cell_there_is_no_table(tmp_path, monkeypatch, capsys):

@@ -134,7 +134,8 @@ def test_tilted_robots_are_slowed_at_every_control_step(pair, loco):
 
 
 def test_a_gait_begins_no_faster_than_its_bound(pair, loco):
-    """A bound below the robot's start frequency of 3.5 Hz takes precedence."""
+    """A tuned bound below the robot's start frequency of 3.5 Hz takes precedence, whereas one that
+    the policy has always had does not: a tuning of something else leaves the start as it is."""
     assert loco.robot.start_frequency == 3.5
     for assignment, most in (("decoder.frequency.high=2.5", 2.5), ("decoder.vx.high=0.4", 3.5)):
         driver = tuned(pair, assignment)

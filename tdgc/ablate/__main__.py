@@ -32,6 +32,9 @@ from tdgc.show import plots
 from tdgc.sim.terrain import EDITION, family_number, is_map
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
+#: Settings of a training that have a flag of their own here.
+_FLAGS = {"seed": "--seeds", "steps": "--steps", "workers": "--workers", "low": "--low"}
+
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
@@ -85,6 +88,22 @@ def choose_seeds(text: str) -> list[int]:
         return list(dict.fromkeys(int(part) for part in text.split(",")))
     except ValueError:
         raise InputError(f"cannot read --seeds '{text}'; write e.g. 42,43") from None
+
+
+def check_trainings(runner: Runner, chosen: Sequence[Variant], seeds: Sequence[int]) -> None:
+    """Refuse invalid settings at once, not after hours of training.
+
+    Raises:
+        InputError: a setting cannot be used, or one that has a flag is among those of ``--set``.
+    """
+    for setting in runner.settings:
+        name = setting.partition("=")[0].strip()
+        if name in _FLAGS:
+            raise InputError(f"--set cannot change '{name}' here; use {_FLAGS[name]}")
+    steps = [] if runner.steps is None else [f"steps={runner.steps}"]
+    with_overrides(HighTrainConfig(), [*steps, *(f"seed={seed}" for seed in seeds)])
+    for variant in chosen:
+        with_overrides(HighTrainConfig(), runner.training_settings(variant))
 
 
 def without_missing(chosen: Sequence[Variant], low: Path) -> list[Variant]:
@@ -205,8 +224,7 @@ def main(arguments: list[str] | None = None) -> int:
     )  # fmt: skip
     try:
         chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
-        for variant in chosen:  # invalid settings fail now, not after hours of training
-            with_overrides(HighTrainConfig(), runner.training_settings(variant))
+        check_trainings(runner, chosen, seeds)
         if args.only is None:
             chosen = without_missing(chosen, args.low)
         tiles = runner.tiles()

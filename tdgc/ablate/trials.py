@@ -134,6 +134,10 @@ class Runner:
             high = whole / "policy"
             if not (whole / "cell.json").is_file():
                 raise TrialError(f"it needs '{WHOLE}' with seed {trial.seed}, which is missing")
+        elif trial.variant.policy == "teacher":
+            # As it taught ``full``, with any seed, if that has been trained.
+            taught = sorted(self.out.glob(f"{WHOLE}-*/cell.json"))
+            high = taught[0].with_name("policy") if taught else None
         self._seconds_left()
         began = time.monotonic()
         folder.mkdir(parents=True, exist_ok=True)

@@ -88,6 +88,8 @@ def choose(
         ValueError: a name is not allowed or is given twice.
     """
     names = everything if text == "all" else tuple(text.split(","))
+    if "all" in names:
+        raise ValueError(f"'all' must stand alone, not in '{text}'")
     for name in names:
         if name not in allowed:
             raise ValueError(f"unknown {what} '{name}'; allowed: all, {', '.join(allowed)}")

@@ -2,8 +2,10 @@
 
 import contextlib
 import csv
+import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,6 @@ from tqdm import tqdm
 
 from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
-from tdgc.errors import InputError
 from tdgc.files import atomic, make_folder, write_json
 from tdgc.parallel.worker import WorkerError
 from tdgc.sim.terrain import EDITION
@@ -19,8 +20,9 @@ from tdgc.sim.terrain import EDITION
 #: Files written by ``write_results``.
 FILES = ("episodes.csv", "summary.json", "trajectories.npz")
 _FILMS = ("films/film_*", "films/sheet_*", "films/strip_*")
-#: What may stop an evaluation: Ctrl-C, a robot that blows up, a full disk, a dead process.
-STOPS = (KeyboardInterrupt, FloatingPointError, OSError, WorkerError)
+#: What may stop an evaluation: Ctrl-C or SIGTERM, a robot that blows up, a full disk or memory, a
+#: dead process.
+STOPS = (KeyboardInterrupt, FloatingPointError, OSError, MemoryError, WorkerError)
 #: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and
 #: the benchmark editions of the tiles and of the policies' training.
 PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
@@ -236,8 +238,8 @@ def salvage(
     cells: Sequence[Cell],
     editions: Mapping[str, int] | None = None,
 ) -> Iterator[tqdm]:
-    """Progress bar for running episodes that keeps what is ``complete`` if one of ``STOPS`` occurs,
-    or if a robot or a terrain file cannot be used where the episodes run.
+    """Progress bar for running episodes that keeps what is ``complete`` whatever stops them;
+    SIGTERM does so as Ctrl-C does, with a KeyboardInterrupt.
 
     It then writes and prints the table of those episodes, adds a note with their number to the
     exception, and re-raises it.
@@ -248,10 +250,11 @@ def salvage(
         cells: all batches of the evaluation.
     """
     total = sum(cell.count for cell in cells)
+    before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         with tqdm(total=total, unit="episode", dynamic_ncols=True) as bar:
             yield bar
-    except (*STOPS, InputError) as error:
+    except (Exception, KeyboardInterrupt) as error:
         done = complete(episodes, cells)
         if done:
             print(describe(write_results(folder, done, editions)))
@@ -259,9 +262,17 @@ def salvage(
         else:
             error.add_note(f"no table, as 0 of {total} episodes are of complete cells")
         raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def what_stopped(error: BaseException) -> str:
     """Describe what ended an evaluation in one line, with its notes."""
-    said = "stopped by Ctrl-C" if isinstance(error, KeyboardInterrupt) else str(error)
+    said = str(error) or type(error).__name__  # a MemoryError may say nothing
+    if isinstance(error, KeyboardInterrupt):
+        said = f"stopped by {str(error) or 'Ctrl-C'}"
     return "; ".join([said, *getattr(error, "__notes__", ())])

@@ -214,10 +214,12 @@ class TunedDriver(HierarchyDriver):
         self._bounds = command_bounds(self.bounds).T
         self._gaits = np.array(sorted(GAITS.index(name) for name in tuning.decoder.gaits))
         self._safety = tuning.safety
+        most = tuning.decoder.frequency.high  # a gait still begins faster than the policy's bound
+        self._frequency_limit = np.inf if most is None else most
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         super().begin(loco, goal, family, noise)
-        loco.frequency_limit = self.bounds.frequency[1]
+        loco.frequency_limit = self._frequency_limit
 
     def command(self, step: int) -> Array:
         command = super().command(step).copy()
