@@ -10,6 +10,7 @@ python train_high.py --resume --out runs/high
 import argparse
 import dataclasses
 import functools
+import json
 import math
 import sys
 from collections.abc import Sequence
@@ -30,7 +31,7 @@ from tdgc.config import (
     with_overrides,
 )
 from tdgc.files import checksum
-from tdgc.learn.flags import Machine, add_arguments, configure
+from tdgc.learn.flags import Machine, add_arguments, configure, make_run_folder
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, check_batch, shared_keywords
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, MemoryExchange
@@ -86,7 +87,8 @@ def with_low(config: HighTrainConfig, assignments: Sequence[str]) -> HighTrainCo
         ValueError: a low policy that cannot be used.
     """
     chosen = [text for text in assignments if text.partition("=")[0].strip() == "low"]
-    low = with_overrides(config, chosen).low or find_low()
+    low = with_overrides(config, chosen).low
+    low = find_low() if low is None else low
     env = dataclasses.replace(config.env, commands=load_low(low)[1].commands)
     return dataclasses.replace(config, low=low, env=env)
 
@@ -349,19 +351,20 @@ def main(arguments: list[str] | None = None) -> int:
     if args.init is not None:
         preset += ("imitation.steps=0",)  # imitation would overwrite what that policy has learned
     if args.low is not None:
-        args.assignments.append(f"low={args.low}")
+        args.assignments.append(f"low={json.dumps(args.low)}")
     try:
         if args.resume and (args.no_teacher or PRESETS[args.preset]):
             raise ConfigError("--resume keeps the run's settings: no --preset or --no-teacher")
         start = with_overrides(HighTrainConfig(), preset)
         config = configure(start if args.resume else with_low(start, args.assignments), args)
-        path = config.low or find_low()
+        path = find_low() if config.low is None else config.low
         low, low_config = load_low(path)
         config = pin_low(config, path)
         tqdm.write(f"low policy: {path}")
         check_robot(low_config.robot, low_config.physics, config.env.randomisation)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check(config, low_config.physics.control_dt)
+        make_run_folder(args.out)
         interruption = Interruption(args.time_limit)
         config = with_manner(config, low, args.init)
         meta: dict[str, Any] = {

@@ -29,7 +29,7 @@ from tdgc.config import (
     with_overrides,
 )
 from tdgc.errors import StoppedError
-from tdgc.learn.flags import Machine, add_arguments, configure
+from tdgc.learn.flags import Machine, add_arguments, configure, make_run_folder
 from tdgc.learn.ppo import NoiseScaledRate, check_batch, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.cores import usable_cores
@@ -209,6 +209,7 @@ def main(arguments: list[str] | None = None) -> int:
             "code": __version__,
             "benchmark": EDITION,
         }
+        make_run_folder(args.out)
         interruption = Interruption(args.time_limit)
         run = Run(args.out, config, meta, summarise, interruption, args.init)
         calibrating = functools.partial(finish, args.out, config, interruption)

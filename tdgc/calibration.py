@@ -86,7 +86,8 @@ _SIGN = np.where(np.isin(NAMES, SIDEWAYS), -1.0, 1.0)  # of commands under left-
 def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     """Commands given to ``robots`` on a plane and their mean velocities, (n, 15) and (n, 3).
 
-    Velocities are in the heading frame. Robots that fell are left out, so n may be smaller.
+    Velocities are in the heading frame. Robots that fell are left out, so n may be smaller; it is 0
+    if the simulation of one diverged, which spoils those of the others.
     """
     config = load_low(low)[1]
     rng = np.random.default_rng((_STREAM, seed))
@@ -95,13 +96,16 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     command[:, :3] = middle + _MEASURED * (command[:, :3] - middle)
     settle = round(_SETTLE_SECONDS / config.physics.control_dt)
     up, total, steps = np.ones(robots, dtype=bool), np.zeros((robots, 3)), 0
-    for step, loco in enumerate(walk_on_plane(low, robots, _WALK_SECONDS, seed)):
-        state = loco.world.state
-        up &= ~is_fallen(loco.world)
-        if step > settle:
-            total += np.column_stack([state.heading_vel[:, :2], state.ang_vel[:, 2]])
-            steps += 1
-        loco.command[:] = command
+    try:
+        for step, loco in enumerate(walk_on_plane(low, robots, _WALK_SECONDS, seed)):
+            state = loco.world.state
+            up &= ~is_fallen(loco.world)
+            if step > settle:
+                total += np.column_stack([state.heading_vel[:, :2], state.ang_vel[:, 2]])
+                steps += 1
+            loco.command[:] = command
+    except FloatingPointError:
+        return command[:0], total[:0]
     return command[up], total[up] / steps
 
 

@@ -1,6 +1,8 @@
 """Calibration: responses are learned and inverted, and a copy of the policy learns the result."""
 
 import dataclasses
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +10,13 @@ import pytest
 import torch as th
 
 from tdgc import calibration, policies
+from tdgc.benchmark.tracking import walk_on_plane
 from tdgc.calibration import Corrector, ResponseModel, distil, measure, shown, training_tasks
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
 from tdgc.sim.commands import INDEX
 from tdgc.sim.gaits import GAITS, gait_embedding
-from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import Array, action_scale
 from tdgc.tasks.low_env import LowLevelTask
@@ -144,6 +147,18 @@ def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None
     assert len(rows) >= 2
     twice = measure(low, 24, seed=5)
     assert (twice[0] == given).all() and (twice[1] == reached).all()
+
+
+def test_robots_beside_one_that_diverges_do_not_count(
+    low: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def walk(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Locomotion]:
+        yield from itertools.islice(walk_on_plane(low, m, seconds, seed), 3)
+        raise FloatingPointError("the simulation diverged")
+
+    monkeypatch.setattr(calibration, "walk_on_plane", walk)
+    given, reached = measure(low, 5, seed=5)
+    assert given.shape == (0, 15) and reached.shape == (0, 3)
 
 
 def test_measured_velocities_are_those_that_robots_walk_at() -> None:

@@ -149,6 +149,17 @@ def test_ranges_grow_only_where_all_is_tracked(poor: dict[str, float], grows: bo
     assert (draw.share > before).all() == grows
 
 
+@pytest.mark.parametrize("name", ["track_lin_vel", "track_yaw_rate"])
+def test_a_tracking_reward_that_is_switched_off_holds_no_gait_back(name: str) -> None:
+    weights = dataclasses.replace(CONFIG.rewards, **{name: 0.0})
+    config = dataclasses.replace(CONFIG, rewards=weights)
+    draw = CommandDraw(config, np.random.default_rng(0), training=True)
+    before, steps = draw.share.copy(), np.full(4, 1e6)
+    sums = {key: steps * getattr(weights, key) for key in ("track_lin_vel", "track_yaw_rate")}
+    draw.judge({"steps": steps, "match": steps} | sums, 4)
+    assert (draw.share > before).all()
+
+
 def test_velocities_and_yaw_rates_are_drawn_from_a_share_of_their_ranges() -> None:
     draw = CommandDraw(CONFIG, np.random.default_rng(0), training=True)
     draw.share[:] = 0.25

@@ -13,9 +13,15 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
+from tdgc.config import (
+    CommandRanges,
+    LowLevelConfig,
+    PhysicsConfig,
+    RandomisationConfig,
+    RobotConfig,
+)
 from tdgc.parallel.group import TaskGroup
-from tdgc.sim.commands import INDEX, default_command, gait_index
+from tdgc.sim.commands import INDEX, command_bounds, default_command, gait_index
 from tdgc.sim.gaits import gait_embedding
 from tdgc.sim.observation import columns, width
 from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
@@ -23,7 +29,8 @@ from tdgc.sim.terrain import make_tile, tile_rng
 from tdgc.state import State, split
 from tdgc.tasks import low_env
 from tdgc.tasks.command_draw import PRONK
-from tdgc.tasks.crossings import within
+from tdgc.tasks.crossings import Crossings, within
+from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.leaps import DURATION
 from tdgc.tasks.low_env import LowLevelEnv, LowLevelTask, make_task
@@ -419,6 +426,26 @@ def test_crossing_velocities_keep_their_direction_within_the_ranges() -> None:
     task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     np.testing.assert_allclose(task.locomotion.command[0, :2], [0.6, 0.6], atol=1e-9)
     task.close()
+
+
+@pytest.mark.parametrize(
+    ("height", "at_level_10"),
+    [((-0.03, 0.05), (0.0, 0.05)), ((-0.05, -0.02), (-0.02, -0.02)), ((0.02, 0.05), (0.02, 0.05))],
+)
+def test_crossing_robots_do_not_crouch_on_high_levels(
+    height: tuple[float, float], at_level_10: tuple[float, float]
+) -> None:
+    """Their body height is not lowered where the ranges allow that, and stays within them."""
+    commands = CommandRanges(body_height=height, pitch=(0.1, 0.3))
+    config = LowLevelConfig(families=("stair",), commands=commands)
+    crossings = Crossings(config, ("stair",), Episodes(1, 1), np.random.default_rng(0))
+    crossings._episodes.crossing[:] = True
+    gaits, bounds = np.full((1, 4), 0.25), command_bounds(commands).T[:, None]
+    low, high = bounds.copy()
+    crossings.narrow(np.arange(1), np.array([10]), gaits, low, high)
+    j, pitch = INDEX["body_height"], INDEX["pitch"]
+    assert (low[0, j], high[0, j]) == at_level_10
+    assert 0.1 == low[0, pitch] <= high[0, pitch] < 0.3
 
 
 def test_an_episode_ends_with_the_crossing() -> None:

@@ -760,6 +760,10 @@ def test_flags_and_folders_that_cannot_be_used(
             "env.commands.vy=[-0.2,0.6]",
             "commands.vy must be the same to both sides for a symmetric",
         ),
+        (
+            "env.commands.duration=[40,60]",
+            "'env.commands.duration' must be [low, high] with 0 < low <= high < 1, not [40,",
+        ),
         ("start_speed=3", "'start_speed' or 'start_swing' is out of bounds: vx 3.0 is outside "),
         ("ppo.minibatches=0", "'ppo.minibatches' must be at least 1, not 0"),
         ("ppo.minibatches=101", "'ppo.minibatches' must be at most the 100 robots, not 101"),
@@ -786,7 +790,17 @@ def test_flags_and_folders_that_cannot_be_used(
     assert train_high.main([*short, "--out", str(empty)]) == 2
     message = "'ppo.n_steps' times 'n_envs' per 'ppo.minibatches' must be at least 2, not 1"
     assert message in capsys.readouterr().err
+    for low in ("", "null", "7"):  # paths, whatever they look like
+        assert train_high.main(["--low", low, "--out", str(empty)]) == 2
+        assert f"{low}.json: no such file" in capsys.readouterr().err
+    for train in (train_low, train_high):
+        assert train.main(["--init", "x", "--out", str(empty)]) == 2
+        assert capsys.readouterr().err.endswith("x.json: no such file\n")
     assert not empty.exists()
+    for train in (train_low, train_high):  # before the teacher is tried out
+        assert train.main(["--out", str(used / "log.jsonl")]) == 2
+        message = f"--out '{used / 'log.jsonl'}' cannot be used: File exists"
+        assert message in capsys.readouterr().err
 
 
 def test_a_run_killed_before_its_first_checkpoint_leaves_its_folder_free(
@@ -798,6 +812,9 @@ def test_a_run_killed_before_its_first_checkpoint_leaves_its_folder_free(
     assert train_low.main(flags) == 2
     assert "'ppo.batch_size' must be at least 2" in capsys.readouterr().err
     (tmp_path / "policy.json").touch()
+    assert train_low.main(flags) == 2
+    assert "holds a run already" in capsys.readouterr().err
+    (tmp_path / "config.json").unlink()  # somebody put a policy there
     assert train_low.main(flags) == 2
     assert "holds a run already" in capsys.readouterr().err
 
@@ -825,6 +842,21 @@ def test_flags_come_after_a_preset(tmp_path: Path, capsys: pytest.CaptureFixture
         assert "train_high.py: --resume keeps " in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         train_high.main(["--no-teacher", "--preset", "paper", *out])
+
+
+@pytest.mark.usefixtures("inline_workers")
+def test_a_start_from_a_policy_of_other_settings_names_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["--n-envs", "4", "--workers", "1", "--set", "ppo.lstm=8", "--set", "ppo.minibatches=4"]
+    small += ["--set", "imitation.steps=0", "--time-limit", "0"]
+    first, slower = tmp_path / "first", tmp_path / "slower"
+    assert train_high.main([*small, "--out", str(first)]) == 0
+    begin = ["--init", str(first / "policy"), "--set", "env.commands.vx=[-1,0.8]"]
+    assert train_high.main([*small, *begin, "--out", str(slower)]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if "was trained with" in line]
+    vx = "env.commands.vx=[-1.0, 1.2], not [-1.0, 0.8]"
+    assert told == [f"{first / 'policy'} was trained with {vx}"]
 
 
 def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,7 @@ from tdgc.config.low import CommandDrawConfig, CrossingConfig, LowLevelConfig, L
 from tdgc.config.settings import (
     ConfigError,
     Range,
+    differences,
     from_dict,
     read_json,
     recorded,
@@ -53,6 +54,7 @@ __all__ = [
     "RecurrentPPOConfig",
     "RobotConfig",
     "TeacherConfig",
+    "differences",
     "from_dict",
     "read_json",
     "recorded",

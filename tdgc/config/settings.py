@@ -20,6 +20,7 @@ from tdgc.errors import InputError
 #: Types of settings. The annotation is the constraint on a value, as worded in error messages.
 Range = typing.Annotated[tuple[float, float], "[low, high] with low <= high"]
 PositiveRange = typing.Annotated[tuple[float, float], "[low, high] with 0 < low <= high"]
+ShareRange = typing.Annotated[tuple[float, float], "[low, high] with 0 < low <= high < 1"]
 Share = typing.Annotated[float, "from 0 to 1"]
 Positive = typing.Annotated[float, "above 0"]
 NotNegative = typing.Annotated[float, "at least 0"]
@@ -31,6 +32,7 @@ GaitShares = typing.Annotated[tuple[Share, Share, Share, Share], "shares that ad
 _HOLDS: dict[Any, Callable[[Any], bool]] = {
     Range: lambda bounds: bounds[0] <= bounds[1],
     PositiveRange: lambda bounds: 0.0 < bounds[0] <= bounds[1],
+    ShareRange: lambda bounds: 0.0 < bounds[0] <= bounds[1] < 1.0,
     Share: lambda share: 0.0 <= share <= 1.0,
     Positive: lambda number: number > 0.0,
     NotNegative: lambda number: number >= 0.0,
@@ -141,6 +143,17 @@ def _missing(whole: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[tupl
             yield from ((f"{key}.{name}", default) for name, default in below)
         elif key not in data:
             yield key, json.dumps(value)
+
+
+def differences(before: Any, now: Any, where: str) -> Iterator[str]:
+    """Settings that differ between two tables of the same kind, such as ``env.gamma=0.99, not
+    0.98``; a key that only one of them has is left out."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for key in before:
+            if key in now:
+                yield from differences(before[key], now[key], f"{where}.{key}")
+    elif before != now:
+        yield f"{where}={json.dumps(before)}, not {json.dumps(now)}"
 
 
 def with_overrides(config: Config, assignments: Iterable[str]) -> Config:

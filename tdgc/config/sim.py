@@ -10,6 +10,7 @@ from tdgc.config.settings import (
     PositiveRange,
     Range,
     Share,
+    ShareRange,
 )
 
 
@@ -42,10 +43,10 @@ class RobotConfig:
     )
     # Whether q0 follows the commanded behaviour (``robot.commanded_pose``); fixed in the paper.
     commanded_pose: bool = True
-    # Whether q0 also walks: it carries the robot's weight, and its feet follow Raibert's footholds
-    # (``robot.walking_pose``). With legs this soft, a pose that ignores the load sags by 5 cm and
-    # drags its swing feet: with zero actions, feet commanded to 8 cm in trot do not leave the
-    # ground.
+    # Whether such a q0 also walks: it carries the robot's weight, and its feet follow Raibert's
+    # footholds (``robot.walking_pose``). With legs this soft, a pose that ignores the load sags by
+    # 5 cm and drags its swing feet: with zero actions, feet commanded to 8 cm in trot do not leave
+    # the ground.
     commanded_gait: bool = field(default=True, metadata={"before": False})
     # Gait cycles after a start or a change of gait over which q0's swing height and stride grow to
     # the commanded ones: of 21 falls while walking with random changes of gait, 19 came within
@@ -111,7 +112,7 @@ class CommandRanges:
     yaw_rate: Range = (-1.0, 1.0)  # rad/s, left turn positive
     body_height: Range = (-0.03, 0.05)  # m, added to the standing height of 0.30 m
     frequency: PositiveRange = (2.0, 4.0)  # Hz, gait cycles per second
-    duration: PositiveRange = (0.4, 0.6)  # 1, duty factor: share of a cycle in stance
+    duration: ShareRange = (0.4, 0.6)  # 1, duty factor: share of a cycle in stance
     swing_height: Range = (0.03, 0.24)  # m, apex of the foot above the ground
     pitch: Range = (-0.3, 0.3)  # rad, nose down positive
     roll: Range = (-0.2, 0.2)  # rad, left side up positive

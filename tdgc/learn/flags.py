@@ -6,6 +6,7 @@ from typing import NamedTuple, TypeVar
 
 import torch as th
 
+from tdgc import policies
 from tdgc.config import (
     ConfigError,
     HighTrainConfig,
@@ -14,6 +15,7 @@ from tdgc.config import (
     recorded,
     with_overrides,
 )
+from tdgc.files import make_folder
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.worker import MakeLink, ProcessLink
@@ -89,6 +91,7 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
 
     Raises:
         ConfigError: nothing to resume, a run folder already in use, or an invalid flag.
+        PolicyFileError: the policy of ``--init`` cannot be read.
         ClusterError: the cluster cannot be used, or has fewer CPUs than there are workers.
     """
     stored, seed = args.out / "config.json", None
@@ -111,8 +114,10 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
                 f"{error}; a run of another version cannot be resumed: start one in another "
                 f"folder, with --init {args.out / 'policy'} to begin from its policy"
             ) from error
-    elif stored.exists() and _has_begun(args.out):
+    elif _has_begun(args.out):
         raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
+    if args.init is not None:
+        policies.load(args.init)  # fail before anything is written
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
     given: list[str] = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
     config = with_overrides(config, [*given, *args.assignments])
@@ -127,6 +132,18 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
     if config.workers > config.n_envs:
         raise ConfigError(f"workers must be 1 to the {config.n_envs} robots, not {config.workers}")
     return config
+
+
+def make_run_folder(out: Path) -> None:
+    """Make the run folder ``out``, so that one that cannot be used fails before any simulation.
+
+    Raises:
+        ConfigError: it cannot be made or written to.
+    """
+    try:
+        make_folder(out)
+    except OSError as error:
+        raise ConfigError(f"--out '{out}' cannot be used: {error.strerror}") from error
 
 
 def _has_begun(run: Path) -> bool:

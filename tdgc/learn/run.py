@@ -16,7 +16,7 @@ import os
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -30,7 +30,7 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tqdm import tqdm
 
 from tdgc import policies
-from tdgc.config import HighTrainConfig, LowTrainConfig, to_dict
+from tdgc.config import HighTrainConfig, LowTrainConfig, differences, to_dict
 from tdgc.errors import InputError
 from tdgc.files import write_json, write_text
 from tdgc.learn.checkpoints import Checkpoint
@@ -100,7 +100,7 @@ class Run:
     """A run of a trainer.
 
     Attributes:
-        folder: the run folder.
+        folder: the run folder, which exists.
         config: of the whole run; written to the folder.
         meta: stored in the policy's file.
         summarise: sums of all workers -> values to log.
@@ -132,8 +132,7 @@ class Run:
             Exception: what ``finish`` raises.
         """
         if self.init is not None:
-            policies.load(self.init)  # fail before anything is written
-        self.folder.mkdir(parents=True, exist_ok=True)
+            self._tell_changes(policies.load(self.init).meta)
         finished, unsaved = True, None
         with sole_user(self.folder):
             last = Checkpoint.newest(self.folder, tqdm.write) if resume else None
@@ -146,6 +145,13 @@ class Run:
                 finish()
             else:
                 self.interruption.tell(self.folder)
+
+    def _tell_changes(self, before: Mapping[str, Any]) -> None:
+        """Print which settings of the environment and of the low policy differ from those in
+        ``before``, the metadata of ``init``, as its actions may have meant something else."""
+        for part, name in (("config", "env"), ("low", "low")):
+            for change in differences(before.get(part), self.meta.get(part), name):
+                tqdm.write(f"{self.init} was trained with {change}")
 
     def _go_through(
         self, phase: Phase, last: Checkpoint | None

@@ -122,6 +122,9 @@ class Crossings:
         low[:, height] *= 1.0 - d
         low[:, bend] *= (1.0 - (1.0 - c.bend) * d)[:, None]
         high[:, bend] *= (1.0 - (1.0 - c.bend) * d)[:, None]
+        for j in (height, *bend):  # ranges without 0 narrow to their end that is nearest to it
+            low[:, j] = np.clip(low[:, j], self._low[j], self._high[j])
+            high[:, j] = np.clip(high[:, j], self._low[j], self._high[j])
 
     def draw(self, index: NDArray[np.integer], gait: Ints, values: Array, grown: float) -> None:
         """Draw how the robots ``index`` (n,) cross, given their gaits (n,) and continuous commands
