@@ -209,18 +209,12 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     groups = flags.add_arguments(parser, "runs/mujoco")
     groups.policies.add_argument("--export", type=Path, required=True, help="folder of tdgc.export")
     groups.episodes.add_argument(
-        "--armature", type=float, metavar="KG_M2", help="rotor inertia of each joint (0.01 kg m^2)"
-    )
-    groups.episodes.add_argument(
-        "--joint-friction", type=float, metavar="NM", help="dry friction of each joint (0 N m)"
-    )
-    groups.episodes.add_argument(
         "--set",
         dest="assignments",
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="change MuJoCo's settings, e.g. solref=0.02; may be repeated",
+        help="change MuJoCo's settings, e.g. armature=0; may be repeated",
     )
     groups.looked_at.add_argument(
         "--log",
@@ -254,9 +248,7 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
     for flag, value in (("--video", args.video), ("--log", args.log)):
         if args.gui and value:
             raise ValueError(f"--gui only shows the robot: no {flag}")
-    given = {key: getattr(args, key) for key in ("armature", "joint_friction")}
-    flagged = [f"{key}={value}" for key, value in given.items() if value is not None]
-    config = with_overrides(MujocoConfig(), [*args.assignments, *flagged])
+    config = with_overrides(MujocoConfig(), args.assignments)
     controller = load(args.export)
     controller.robot()
     config.physics(controller.dt, controller.low.table["joint_control"]["rate"]["value"])

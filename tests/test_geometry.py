@@ -117,8 +117,13 @@ def test_settings_for_another_robot(a1: RobotConfig, robot: RobotConfig) -> None
 
 
 def test_a_urdf_that_says_nothing_of_its_motors(tmp_path: Path) -> None:
-    silent = changed(tmp_path, (' effort="23.7" velocity="30"', ""))
+    hips_and_thighs, calves = (' effort="23.7" velocity="30"', ""), (' effort="35.5"', "")
+    silent = changed(tmp_path, hips_and_thighs, calves, (' velocity="20"', ""))
     assert set(fitted(silent)) == {"base_height", "stance", "kp", "kd"}
+    # What it says of some joints counts; the others have the shipped robot's limits.
+    partly = changed(tmp_path, hips_and_thighs, (' effort="35.5"', ' effort="80"'))
+    assert fitted(partly)["torque_limit"] == (23.7, 23.7, 80.0)
+    assert fitted(partly)["speed_limit"] == (30.0, 30.0, 20.0)
     with pytest.raises(ConfigError, match=r"limit effort must be at least 0, not -1$"):
         fitted(changed(tmp_path, ('effort="35.5"', 'effort="-1"')))
 
@@ -497,6 +502,23 @@ def test_commanded_and_exported_pose_of_another_robot(robot: RobotConfig) -> Non
             np.testing.assert_allclose(found.numpy(), wanted[k], atol=1e-6)
 
 
+def test_the_graph_bends_a_leg_whose_calf_is_longer_than_its_thigh(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With the foot near the hip, the calf leans by more than a right angle."""
+    shipped = read_geometry(RobotConfig())
+    limits = np.tile([-2.9, 2.9], (12, 1))
+    long = dataclasses.replace(shipped, thigh=0.15, calf=0.25, joint_limits=limits)
+    monkeypatch.setattr(graphs, "read_geometry", lambda robot: long)
+    graph, rng = graphs.Pose(RobotConfig(), 0.02), np.random.default_rng(0)
+    offset = np.stack([rng.uniform(-0.1, 0.1, 4), 0.08 * np.array([1, -1, 1, -1])], axis=1)
+    for height in (-0.11, -0.2, -0.3):
+        feet = np.column_stack([long.hips + offset, np.full(4, height)])
+        place = [th.from_numpy(part)[None] for part in (*offset.T, np.full(4, height))]
+        found = th.cat(graph._angles(*place)).T.flatten()
+        np.testing.assert_allclose(found.numpy(), leg_angles(long, feet[None])[0], atol=1e-6)
+
+
 def test_rewards_know_another_robots_limits(robot: RobotConfig) -> None:
     """A knee at its limit of -2.6 rad is 0.0855 rad beyond the middle 0.9 of -2.6..-0.89 rad."""
     task = LowLevelTask(LowLevelConfig(robot=robot), 1, seed=0)
@@ -517,6 +539,21 @@ def test_rewards_know_another_robots_limits(robot: RobotConfig) -> None:
 def test_a_urdf_that_is_not_there() -> None:
     with pytest.raises(ConfigError, match=r"^robot\.urdf: no file 'urdf/centipede\.urdf' here"):
         read_geometry(RobotConfig(urdf="urdf/centipede.urdf"))
+
+
+def test_a_urdf_that_is_not_the_repositorys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of the same name in the working folder would silently replace the shipped robot."""
+    own = tmp_path / RobotConfig().urdf
+    own.parent.mkdir()
+    own.write_text(SHIPPED, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert urdf_path(RobotConfig()) == own
+    own.write_text(SHIPPED.replace("23.7", "33.5"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"'urdf/quadruped\.urdf' here is not the repository's"):
+        urdf_path(RobotConfig())
+    assert urdf_path(RobotConfig(urdf=str(own))) == own
 
 
 def test_a_urdf_elsewhere(tmp_path: Path) -> None:

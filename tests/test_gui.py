@@ -56,4 +56,4 @@ def test_no_display(
     driver = ["--policies", "gp"] if mode == "watch" else []
     assert evaluate.main(["--gui", mode, *driver]) == 2
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("evaluate.py: Bullet's window needs ")
+    assert len(lines) == 1 and lines[0].startswith("evaluate.py: a window needs ")

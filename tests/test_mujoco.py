@@ -189,7 +189,7 @@ def test_a_timestep_must_fit_the_control() -> None:
     physics = MujocoConfig(timestep=0.001).physics(0.02, 200.0)
     assert (physics.substeps, physics.hold, physics.joint_steps) == (20, 5, 4)
     with pytest.raises(ConfigError, match=r"'timestep' must divide .* 0.005 s, not 0.003"):
-        MujocoConfig(timestep=0.003).physics(0.02, 200.0)
+        MujocoConfig(timestep=0.003, solref=0.02).physics(0.02, 200.0)
 
 
 @pytest.mark.parametrize("visual", [False, True])
@@ -355,6 +355,7 @@ def test_a_log_with_gaps_is_refused(
         ({"family": None}, "lacks 'family'; it needs time, gravity, "),
         ({"goal": whole["goal"][:-1]}, "'goal' must be numbers"),
         ({"goal": whole["goal"].astype(str)}, "'goal' must be numbers"),
+        ({"goal": whole["goal"] > 0.0}, "'goal' must be numbers, not of type bool"),
         ({name: array[:1] for name, array in whole.items()}, "needs two rows at least"),
     ):
         with pytest.raises(LogError) as refused:
@@ -416,7 +417,12 @@ def test_the_end_is_told_or_seen(
     goal = whole["goal"].copy()
     goal[-1] *= 0.05
     near = edited(slipped[1], tmp_path / "near.npz", goal=goal)
-    assert log.outcome(log.read(near, controller), controller) == "reached"
+    reached = log.read(near, controller)
+    assert log.outcome(reached, controller) == log.outcome(reached, controller, "reached")
+    assert log.outcome(reached, controller) == "reached"
+    assert log.outcome(reached, controller, "fell") == "fell"  # into the goal's circle
+    with pytest.raises(LogError, match="near: reaches the goal, so it has not run out of time"):
+        log.outcome(reached, controller, "timeout")
 
 
 # --- the commands -------------------------------------------------------------------------------
@@ -449,7 +455,7 @@ def test_a_log_is_diagnosed(
 
 def test_the_benchmark_writes_what_evaluate_writes(folder: Path, tmp_path: Path) -> None:
     flags = ["--export", str(folder), "--levels", "9", "--families", "rough,gap", "--log"]
-    small = [*flags, "--episodes", "2", "--workers", "1", "--armature", "0.005"]
+    small = [*flags, "--episodes", "2", "--workers", "1", "--set", "armature=0.005"]
     assert runner.main([*small, "--set", "friction=0.7", "--out", str(tmp_path)]) == 0
     with open(tmp_path / "episodes.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -526,8 +532,12 @@ def test_what_is_complete_when_it_is_stopped_is_kept(
         ("--set cone=round", "'cone' must be one of elliptic, pyramidal"),
         ("--set timestep=0", "'timestep' must be above 0, not 0"),
         ("--set armature=-0.1", "'armature' must be at least 0, not -0.1"),
-        ("--set timestep=0.003", "'timestep' must divide the joint control's step"),
-        ("--armature nan", "'armature' must be"),
+        ("--set timestep=0.005", "'solref' must be at least twice 'timestep', 0.01 s, not 0.005"),
+        (
+            "--set timestep=0.003 --set solref=0.01",
+            "'timestep' must divide the joint control's step",
+        ),
+        ("--set armature=NaN", "'armature' must be"),
         ("--export {0}/old", "an interface of version 1, this package reads "),
         ("--export {0}/robot", "FL_calf_joint turns from -2.82 to -0.7 rad, that robot's from"),
     ],

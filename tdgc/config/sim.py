@@ -24,7 +24,7 @@ class RobotConfig:
 
     urdf: str = "urdf/quadruped.urdf"  # path from the working directory or the repository
     kp: Positive = 20.0  # N m/rad (benchmark, Walk These Ways)
-    kd: NotNegative = 0.6  # N m s/rad (benchmark: 0.5-0.7)
+    kd: Positive = 0.6  # N m s/rad (benchmark: 0.5-0.7)
     # Of hip, thigh and calf, in N m and rad/s (Go1).
     torque_limit: tuple[Positive, Positive, Positive] = (23.7, 23.7, 35.5)
     speed_limit: tuple[Positive, Positive, Positive] = (30.0, 30.0, 20.0)

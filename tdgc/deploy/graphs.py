@@ -233,13 +233,15 @@ class Pose(nn.Module):
         down = (y * y + z * z - out * out).clamp(min=0.0).sqrt()
         square = x * x + down * down
         bend = (square - (upper * upper + lower * lower)) / (2.0 * upper * lower)
-        # ONNX Runtime has inverse trigonometric functions in float32 only, and no arctan2.
+        # ONNX Runtime has inverse trigonometric functions in float32 only, and no arctan2: the lean
+        # of a calf that is longer than the thigh may exceed a right angle, its half does not.
         calf = (-th.acos(bend.clamp(-1.0, 1.0).float())).double()
         calf = calf.clamp(self.lowest, self.highest)
-        lean = lower * th.sin(calf) / (upper + lower * th.cos(calf))
-        slopes = th.cat([(out * z + down * y) / (out * y - down * z), x / down, lean])
-        hip, back, lean = th.atan(slopes.float()).double().chunk(3)
-        return hip, -back - lean, calf
+        along, across = upper + lower * th.cos(calf), lower * th.sin(calf)
+        half = across / ((along * along + across * across).sqrt() + along)
+        slopes = th.cat([(out * z + down * y) / (out * y - down * z), x / down, half])
+        hip, back, half = th.atan(slopes.float()).double().chunk(3)
+        return hip, -back - 2.0 * half, calf
 
 
 class LowGraph(nn.Module):

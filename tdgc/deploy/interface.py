@@ -5,6 +5,7 @@
 
 import functools
 import json
+import math
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -97,12 +98,20 @@ def _misfits(table: Table) -> Iterator[str]:
         for what, size in others.items():
             if size != sizes[name]:
                 yield f"'{name}' has the size {sizes[name]}, its {what} has {size}"
+    if "families" in table and table["task"]["family"]["otherwise"] not in table["families"]:
+        yield f"task.family.otherwise is '{table['task']['family']['otherwise']}', no family"
 
 
 def pair_misfits(low: Table, high: Table) -> Iterator[str]:
     """Describe what in the interfaces of two graphs shows that they are not of one export."""
     if low["robot"]["standing_height"] != high["probes"]["plane_below_trunk"]:
         yield "their standing heights differ"
+    every = next(entry["every"] for entry in high["order"] if entry["graph"] == "high")
+    if not math.isclose(low["rate"]["value"], every * high["rate"]["value"]):
+        yield (
+            f"low runs at {low['rate']['value']:g} Hz, which is not {every} times high's "
+            f"{high['rate']['value']:g} Hz"
+        )
     for mine, trained in zip(high["commands"], low["commands"], strict=True):
         if "low" in mine and (mine["low"] < trained["low"] or mine["high"] > trained["high"]):
             yield f"high's bounds of {mine['name']} exceed low's"

@@ -146,8 +146,10 @@ def read(path: Path, controller: Controller) -> Log:
     for name, shape in shapes.items():
         if name not in table:
             raise LogError(f"{path}: lacks '{name}'; it needs {', '.join(shapes)}")
-        if table[name].shape != shape or table[name].dtype.kind not in "fiu":
+        if table[name].shape != shape:
             raise LogError(f"{path}: '{name}' must be numbers {shape}, not {table[name].shape}")
+        if table[name].dtype.kind not in "fiu":
+            raise LogError(f"{path}: '{name}' must be numbers, not of type {table[name].dtype}")
     values = {name: table[name].astype(np.float64) for name in sizes}
     decisions = np.flatnonzero(np.isfinite(values["decision"]).all(axis=1))
     log = Log(path.stem, table["time"][:, 0].astype(np.float64), values, decisions)
@@ -316,29 +318,31 @@ def replay(log: Log, controller: Controller) -> dict[str, tuple[float, float]]:
 def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
     """How the episode of a log ended.
 
-    ``told`` is the outcome that an observer gave, one of ``ENDS``; it is overridden if the log
-    reaches the goal.
+    ``told`` is the outcome that an observer gave, one of ``ENDS``. As in the benchmark, a robot
+    that falls or collides at the goal has not reached it.
 
     Raises:
         LogError: the log does not show how the episode ended and ``told`` is None, or ``told`` is
-            "reached" but the log never reaches the goal, or "timeout" but it ends before the
-            horizon.
+            "reached" but the log never reaches the goal, or "timeout" but it does, or ends before
+            the horizon.
     """
+    if told in ("fell", "collided"):
+        return told
     goals, task = log.values["goal"], controller.high.table["task"]
     distance = np.linalg.norm(goals, axis=1)
     if distance.min() < task["goal_radius"]["value"]:
+        if told == "timeout":
+            raise LogError(f"{log.name}: reaches the goal, so it has not run out of time")
         return "reached"
     if told == "reached":
         raise LogError(f"{log.name}: comes no nearer to the goal than {distance.min():.2f} m")
     if controller.over(len(log.time) - 1, None):
-        return told or "timeout"
+        return "timeout"
     if told == "timeout":
         raise LogError(
             f"{log.name}: ends at {log.time[-1]:.2f} s, before the horizon of "
             f"{task['horizon']['value']:g} s"
         )
-    if told is not None:
-        return told
     raise LogError(
         f"{log.name}: ends at {log.time[-1]:.2f} s, {distance[-1]:.2f} m from the goal; say how "
         f"with --outcome {' or '.join(ENDS[1:3])}"

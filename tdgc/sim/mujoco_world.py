@@ -54,8 +54,14 @@ class MujocoConfig:
             joint_rate: Hz, rate at which joint torques are computed.
 
         Raises:
-            ConfigError: ``timestep`` does not divide the step of the joint control.
+            ConfigError: ``timestep`` does not divide the step of the joint control, or is too long
+                for ``solref``.
         """
+        if self.solref < 2.0 * self.timestep:  # MuJoCo would replace it by that
+            raise ConfigError(
+                f"'solref' must be at least twice 'timestep', {2.0 * self.timestep:g} s, not "
+                f"{self.solref:g}"
+            )
         joint_dt = 1.0 / joint_rate
         substeps, hold = round(control_dt / self.timestep), round(joint_dt / self.timestep)
         steps = np.array([substeps, hold]) * self.timestep

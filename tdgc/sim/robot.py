@@ -84,8 +84,9 @@ def fitted(config: RobotConfig) -> dict[str, Any]:
         "kd": round(mass * length**1.5 * ours.kd, 2),
     }
     for name, limits in zip(("torque_limit", "speed_limit"), own.motor_limits, strict=True):
-        if np.isfinite(limits).all():
-            found[name] = tuple(limits.tolist())
+        known = np.isfinite(limits)
+        if known.any():
+            found[name] = tuple(np.where(known, limits, getattr(ours, name)).tolist())
     return found
 
 

@@ -72,12 +72,18 @@ def urdf_path(config: RobotConfig) -> Path:
     """Absolute path of the robot's URDF: as given, or relative to the repository.
 
     Raises:
-        ConfigError: no such file.
+        ConfigError: no such file, or two that differ.
     """
     given = Path(config.urdf)
-    for path in (given, Path(__file__).resolve().parents[2] / given):
-        if path.is_file():
-            return path.resolve()
+    paths = (given, Path(__file__).resolve().parents[2] / given)
+    found = [path.resolve() for path in paths if path.is_file()]
+    if len({path.read_bytes() for path in found}) > 1:
+        raise ConfigError(
+            f"robot.urdf: '{config.urdf}' here is not the repository's; move it or give its full "
+            "path"
+        )
+    if found:
+        return found[0]
     raise ConfigError(f"robot.urdf: no file '{config.urdf}' here or in the repository")
 
 

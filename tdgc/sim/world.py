@@ -588,12 +588,12 @@ def check_display() -> None:
     try:
         x11 = ctypes.CDLL("libX11.so.6")
     except OSError as error:
-        raise WindowError("Bullet's window needs X11, and libX11.so.6 is not installed") from error
+        raise WindowError("a window needs X11, and libX11.so.6 is not installed") from error
     x11.XOpenDisplay.argtypes, x11.XOpenDisplay.restype = [ctypes.c_char_p], ctypes.c_void_p
     x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
     display = x11.XOpenDisplay(None) if name else None
     if not display:
-        raise WindowError(f"Bullet's window needs a display; DISPLAY='{name}' is none")
+        raise WindowError(f"a window needs a display; DISPLAY='{name}' is none")
     x11.XCloseDisplay(display)
 
 
