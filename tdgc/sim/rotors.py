@@ -9,6 +9,9 @@ takes follow from Lagrange's equations, and are given back a joint control later
 
 That is a Jacobi iteration of the equations of motion. With J in both links it converges for any J;
 in the moved link alone it would not, where the trunk is light.
+
+Bullet keeps a link's inertia about its principal axes, so J goes to the one nearest to the joint's
+axis. That is exact where they coincide, as in the shipped robot, and wrong where they are tilted.
 """
 
 import numpy as np
