@@ -338,7 +338,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
         What could not be written, one line each.
 
     Raises:
-        Exception: one of ``STOPS``; the table of the complete cells is written first.
+        BaseException: what stopped it; the table of the complete cells is written first.
     """
     e, out, trained_on = evaluation, evaluation.out, editions(low, drivers)
     cells = plan(list(drivers), e.conditions, e.families, e.levels, e.episodes)

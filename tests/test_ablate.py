@@ -223,11 +223,12 @@ def finish(folder: Path) -> None:
     (folder / EPISODES).write_text("family,level,episode,outcome\ntilt,6,0,reached\n")
 
 
-@pytest.mark.parametrize("trained", [True, False])
+@pytest.mark.parametrize(("trained", "taught"), [(False, False), (True, True), (True, False)])
 def test_the_teacher_leads_as_it_taught_the_full_hierarchy(
-    trained: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained: bool, taught: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It reads from the high policy of ``full`` how it commands the low policy."""
+    """It reads from the high policy of ``full`` how it commands the low policy, unless that was
+    trained without a teacher."""
     asked: list[object] = []
 
     def evaluated(main: object, flags: list[object]) -> None:
@@ -237,11 +238,14 @@ def test_the_teacher_leads_as_it_taught_the_full_hierarchy(
     finish(tmp_path / "of-another")
     if trained:
         finish(tmp_path / "full-7")
+        low = policies.load(LOW)
+        meta = low.meta | ({"teacher": {}} if taught else {})
+        policies.save_copy(tmp_path / "full-7" / "policy", low, {}, meta)
     monkeypatch.setattr(trials, "call", evaluated)
     runner = Runner(tmp_path, LOW, False, ('env.families=["tilt"]',), None, "6", 1, 1, None)
     assert runner.run(Trial(named("teacher"), None)).reached.tolist() == [True]
-    assert ("--high" in asked) == trained
-    if trained:
+    assert ("--high" in asked) == taught
+    if taught:
         assert asked[asked.index("--high") + 1] == tmp_path / "full-7" / "policy"
 
 

@@ -144,6 +144,12 @@ def test_a_gait_begins_no_faster_than_its_bound(pair, loco):
         loco.command[:] = driver.command(0)
         loco.command[:, INDEX["frequency"]] = 2.2
         assert loco.executed()[0, INDEX["frequency"]] == pytest.approx(most)
+    high, config = pair
+    slow = dataclasses.replace(config.commands, frequency=(2.0, 3.0))
+    slower = dataclasses.replace(config, commands=slow)
+    driver = TunedDriver(high, slower, LOW, load(None, ["decoder.vx.high=0.4"]))
+    driver.begin(loco, np.array([[6.0, 0.0]]), "rough")
+    assert loco.executed()[0, INDEX["frequency"]] == pytest.approx(3.5)
 
 
 def test_the_policy_sees_its_own_decisions(pair, loco):

@@ -135,9 +135,10 @@ class Runner:
             if not (whole / "cell.json").is_file():
                 raise TrialError(f"it needs '{WHOLE}' with seed {trial.seed}, which is missing")
         elif trial.variant.policy == "teacher":
-            # As it taught ``full``, with any seed, if that has been trained.
-            taught = sorted(self.out.glob(f"{WHOLE}-*/cell.json"))
-            high = taught[0].with_name("policy") if taught else None
+            # At the speeds at which it taught ``full``, whatever its seed.
+            for done in sorted(self.out.glob(f"{WHOLE}-*/cell.json"))[:1]:
+                if "teacher" in policies.load(done.with_name("policy")).meta:
+                    high = done.with_name("policy")
         self._seconds_left()
         began = time.monotonic()
         folder.mkdir(parents=True, exist_ok=True)

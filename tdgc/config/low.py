@@ -77,7 +77,7 @@ class CommandDrawConfig:
     growth: Share = 0.05  # of the full ranges, added when a gait was tracked well
     # Control steps (4 s) after which a gait with a quarter of the robots is judged.
     growth_steps: Count = 200
-    # To grow, a gait must earn more than these shares of the reward for perfect tracking. At the
+    # To grow, a gait must earn at least these shares of the reward for perfect tracking. At the
     # default sigmas they stand for errors of about 0.26 m/s and 0.32 rad/s.
     growth_velocity: Share = 0.5
     growth_yaw_rate: Share = 0.5

@@ -146,12 +146,11 @@ def _missing(whole: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[tupl
 
 
 def differences(before: Any, now: Any, where: str) -> Iterator[str]:
-    """Settings that differ between two tables of the same kind, such as ``env.gamma=0.99, not
-    0.98``; a key that only one of them has is left out."""
+    """Settings that differ between two tables with the same keys, such as ``ppo.gamma=0.99, not
+    0.98``."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         for key in before:
-            if key in now:
-                yield from differences(before[key], now[key], f"{where}.{key}")
+            yield from differences(before[key], now[key], f"{where}.{key}")
     elif before != now:
         yield f"{where}={json.dumps(before)}, not {json.dumps(now)}"
 

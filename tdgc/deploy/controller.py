@@ -351,7 +351,7 @@ class Controller:
         hip, thigh, calf = pose[:3]
         limits = [tuple(control[k]["value"][:3]) for k in ("torque_limit", "speed_limit")]
         config = RobotConfig(
-            urdf=str(urdf),
+            urdf=str(urdf.absolute()),
             kp=control["kp"]["value"][0],
             kd=control["kd"]["value"][0],
             torque_limit=limits[0],

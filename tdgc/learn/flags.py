@@ -115,7 +115,8 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
                 f"folder, with --init {args.out / 'policy'} to begin from its policy"
             ) from error
     elif _has_begun(args.out):
-        raise ConfigError(f"'{args.out}' holds a run already; use --resume or another --out")
+        either = "--resume or " if stored.exists() else ""
+        raise ConfigError(f"'{args.out}' holds a run already; use {either}another --out")
     if args.init is not None:
         policies.load(args.init)  # fail before anything is written
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}

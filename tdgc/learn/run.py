@@ -30,7 +30,15 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tqdm import tqdm
 
 from tdgc import policies
-from tdgc.config import HighTrainConfig, LowTrainConfig, differences, to_dict
+from tdgc.config import (
+    ConfigError,
+    HighTrainConfig,
+    LowLevelConfig,
+    LowTrainConfig,
+    differences,
+    recorded,
+    to_dict,
+)
 from tdgc.errors import InputError
 from tdgc.files import write_json, write_text
 from tdgc.learn.checkpoints import Checkpoint
@@ -147,11 +155,19 @@ class Run:
                 self.interruption.tell(self.folder)
 
     def _tell_changes(self, before: Mapping[str, Any]) -> None:
-        """Print which settings of the environment and of the low policy differ from those in
-        ``before``, the metadata of ``init``, as its actions may have meant something else."""
-        for part, name in (("config", "env"), ("low", "low")):
-            for change in differences(before.get(part), self.meta.get(part), name):
-                tqdm.write(f"{self.init} was trained with {change}")
+        """Print which settings of the environment and of the low policy's robot differ from those
+        in ``before``, the metadata of ``init``, as its actions may have meant something else."""
+        env = self.config.env
+        try:
+            trained = to_dict(recorded(type(env), before.get("config", {}), self.init))
+        except ConfigError as error:
+            tqdm.write(f"cannot compare the settings: {error}")
+            return
+        for change in (
+            *differences(trained, to_dict(env), "env"),
+            *differences(_robot(before), _robot(self.meta), "low.robot"),
+        ):
+            tqdm.write(f"{self.init} was trained with {change}")
 
     def _go_through(
         self, phase: Phase, last: Checkpoint | None
@@ -198,6 +214,14 @@ class Run:
             return taken, finished, callback.unsaved
         finally:
             env.close()
+
+
+def _robot(meta: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The robot of the low policy that a high policy with the metadata ``meta`` commands."""
+    try:
+        return to_dict(recorded(LowLevelConfig, meta["low"]["config"], "low"))["robot"]
+    except (KeyError, TypeError, ConfigError):
+        return None
 
 
 class RunCallback(BaseCallback):

@@ -72,12 +72,16 @@ def urdf_path(config: RobotConfig) -> Path:
     """Absolute path of the robot's URDF: as given, or relative to the repository.
 
     Raises:
-        ConfigError: no such file, or two that differ.
+        ConfigError: no such file, or two that differ or cannot be read.
     """
     given = Path(config.urdf)
     paths = (given, Path(__file__).resolve().parents[2] / given)
     found = [path.resolve() for path in paths if path.is_file()]
-    if len({path.read_bytes() for path in found}) > 1:
+    try:
+        differ = len(set(found)) > 1 and found[0].read_bytes() != found[1].read_bytes()
+    except OSError as error:
+        raise ConfigError(f"robot.urdf: {error}") from error
+    if differ:
         raise ConfigError(
             f"robot.urdf: '{config.urdf}' here is not the repository's; move it or give its full "
             "path"

@@ -96,7 +96,7 @@ class CommandDraw:
             # At least, not above: a term that is switched off must not keep all ranges narrow.
             good = velocity / samples >= config.growth_velocity * weights.track_lin_vel
             good &= yaw_rate / samples >= config.growth_yaw_rate * weights.track_yaw_rate
-            good &= contact / samples >= config.growth_contact
+            good &= contact / samples > config.growth_contact
             if good and self._training:
                 self.share[g] = min(1.0, self.share[g] + config.growth)
             self.scores[g] = 0.0
