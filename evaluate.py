@@ -274,14 +274,12 @@ class Evaluation:
 
     def make_room(self) -> None:
         """Create the results folder, if there will be any; only a table replaces an earlier one."""
-        if self.mode in gui.MODES:
-            return
         if self.mode == "tracking":
             make_folder(self.out)
-            return
-        left = ["traces/*.parquet", "diagnosis.csv", "tuning.json", report.NAME]
-        left += [name for name, *_ in report.FIGURES]
-        make_room(self.out, left, {"films": self.filmed > 0, "traces": self.traced is not None})
+        elif self.mode == "table":
+            left = ["traces/*.parquet", "diagnosis.csv", "tuning.json", report.NAME]
+            left += [name for name, *_ in report.FIGURES]
+            make_room(self.out, left, {"films": self.filmed > 0, "traces": self.traced is not None})
 
 
 @dataclass(frozen=True)

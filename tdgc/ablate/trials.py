@@ -136,9 +136,9 @@ class Runner:
                 raise TrialError(f"it needs '{WHOLE}' with seed {trial.seed}, which is missing")
         elif trial.variant.policy == "teacher":
             # At the speeds at which it taught ``full``, whatever its seed.
-            for done in sorted(self.out.glob(f"{WHOLE}-*/cell.json"))[:1]:
-                if "teacher" in policies.load(done.with_name("policy")).meta:
-                    high = done.with_name("policy")
+            done = min(self.out.glob(f"{WHOLE}-*/cell.json"), default=None)
+            if done is not None and "teacher" in policies.load(done.with_name("policy")).meta:
+                high = done.with_name("policy")
         self._seconds_left()
         began = time.monotonic()
         folder.mkdir(parents=True, exist_ok=True)
