@@ -25,12 +25,12 @@ from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, Teac
 from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, plan, run_cell
 from tdgc.benchmark.flags import add_arguments, choose, resolve
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import STOPS, describe, make_room, salvage, what_stopped, write_results
+from tdgc.benchmark.results import STOPS, describe, make_room, salvage, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
-from tdgc.errors import InputError, require
+from tdgc.errors import InputError, require, what_stopped
 from tdgc.files import make_folder, write_json
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP

@@ -30,6 +30,7 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
+from tdgc.errors import what_stopped
 from tdgc.files import checksum
 from tdgc.learn.flags import Machine, add_arguments, configure, make_run_folder
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
@@ -45,17 +46,17 @@ from tdgc.show import plots
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.locomotion import check_robot
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import EDITION, may_have_trenches
+from tdgc.sim.terrain import EDITION
 from tdgc.tasks.curriculum import check_rules
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.manners import find_manner, manner_of
+from tdgc.tasks.manners import check_manner, find_manner, manner_of, may_leap, nearest
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.teacher import Skill
-from tdgc.tasks.tiles import check_families, check_levels
+from tdgc.tasks.tiles import check_families, check_levels, left_out
 
 # Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
 # the apprentice alone drives, so that it learns in the states to which its own actions lead.
@@ -118,7 +119,8 @@ def with_manner(config: HighTrainConfig, low: Policy, init: Path | None) -> High
     if imitation.teacher is not None:
         return config
     if init is not None:
-        manner = manner_of(policies.load(init), init)
+        assert config.env.commands is not None  # ``paired`` has set them
+        manner = nearest(manner_of(policies.load(init), init), config.env.commands)
     elif imitation.steps:
         manner = find_manner(low, config.env, tqdm.write)
     else:
@@ -164,7 +166,7 @@ def make_env(
     if taught:
         landing, manner = None, config.imitation.teacher
         assert manner is not None  # ``with_manner`` has set it
-        if any(map(may_have_trenches, env_config.families)):
+        if may_leap(env_config):
             landing = measure_landing(*load_low(low), manner.leap_speed)
             if landing is None:
                 tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
@@ -301,11 +303,19 @@ def check(config: HighTrainConfig, control_dt: float) -> None:
             f"not {env.first_level + env.first_levels}"
         )
     first = HighLevelConfig.first_level, HighLevelConfig.first_levels
-    if config.imitation.steps and (env.first_level, env.first_levels) != first:
-        raise ConfigError(
-            "'env.first_level' and 'env.first_levels' have no effect with imitation, which has its "
-            "own levels; set imitation.steps to 0, or leave them"
-        )
+    if (env.first_level, env.first_levels) != first:
+        if config.imitation.steps:
+            raise ConfigError(
+                "'env.first_level' and 'env.first_levels' have no effect with imitation, which has "
+                "its own levels; set imitation.steps to 0, or leave them"
+            )
+        if env.curriculum != "performance":
+            raise ConfigError(
+                "'env.first_level' and 'env.first_levels' have no effect with env.curriculum "
+                f"{env.curriculum}"
+            )
+    if config.imitation.teacher is not None and env.commands is not None:
+        check_manner(config.imitation.teacher, env.commands)
     parts = {"ppo": ppo.minibatches}
     if config.imitation.steps:
         parts["imitation"] = config.imitation.minibatches
@@ -364,6 +374,8 @@ def main(arguments: list[str] | None = None) -> int:
         check_robot(low_config.robot, low_config.physics, config.env.randomisation)
         config = dataclasses.replace(config, env=paired(config.env, low_config))
         check(config, low_config.physics.control_dt)
+        if missing := left_out(config.env.families, config.n_envs):
+            tqdm.write(f"too few robots for all families: none is on {', '.join(missing)}")
         make_run_folder(args.out)
         interruption = Interruption(args.time_limit)
         config = with_manner(config, low, args.init)
@@ -382,8 +394,11 @@ def main(arguments: list[str] | None = None) -> int:
         if log.exists():
             plots.decision_curve(log, args.out / "training.png")
     except (ValueError, WorkerError, OSError) as error:
-        print(f"train_high.py: {error}", file=sys.stderr)
+        print(f"train_high.py: {what_stopped(error)}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
+    except KeyboardInterrupt as error:
+        print(f"train_high.py: {what_stopped(error)}", file=sys.stderr)
+        sys.exit(1)  # instead of returning, so that a caller stops, too
     return 0
 
 

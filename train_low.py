@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import functools
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +29,7 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.errors import StoppedError
+from tdgc.errors import StoppedError, what_stopped
 from tdgc.learn.flags import Machine, add_arguments, configure, make_run_folder
 from tdgc.learn.ppo import NoiseScaledRate, check_batch, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
@@ -45,7 +46,7 @@ from tdgc.tasks.low_env import make_task
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 from tdgc.tasks.low_statistics import summarise
 from tdgc.tasks.rules import episode_steps
-from tdgc.tasks.tiles import check_families, check_levels
+from tdgc.tasks.tiles import check_families, check_levels, left_out
 
 
 def phases(config: LowTrainConfig, machine: Machine) -> list[Phase]:
@@ -124,6 +125,10 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
         learned = policies.load(out / "uncalibrated")
     robots, done = config.calibration.robots, learned.meta.pop("calibration", None)
     if done is not None and (done["robots"] or not robots):
+        if done["robots"] and not robots:
+            raise ConfigError(
+                f"{out / 'policy'} is already calibrated; without, it is {out / 'uncalibrated'}"
+            )
         for name in ("robots", "turns") if robots else ():
             asked = getattr(config.calibration, name)
             if done[name] != asked:
@@ -203,6 +208,9 @@ def main(arguments: list[str] | None = None) -> int:
         if not args.resume:
             config = fit(config, args.assignments)
         check(config)
+        on_tiles = config.n_envs - math.floor(config.plane_share * config.n_envs)
+        if missing := left_out(config.env.families, on_tiles):
+            tqdm.write(f"too few robots for all families: none is on {', '.join(missing)}")
         meta = {
             "config": to_dict(config.env),
             "seed": config.seed,
@@ -218,8 +226,11 @@ def main(arguments: list[str] | None = None) -> int:
         if log.exists():
             plots.training_curve(log, args.out / "training.png")
     except (ValueError, WorkerError, OSError) as error:
-        print(f"train_low.py: {error}", file=sys.stderr)
+        print(f"train_low.py: {what_stopped(error)}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
+    except KeyboardInterrupt as error:
+        print(f"train_low.py: {what_stopped(error)}", file=sys.stderr)
+        sys.exit(1)  # instead of returning, so that a caller stops, too
     return 0
 
 

@@ -8,10 +8,10 @@
 Robots take random actions in the low policy's MDP, on a plane and on all levels of all families,
 with one worker and with all. The table is printed and written to ``bench.json``. With ``--load``
 there are 10, 100 and 1000 robots on the plane with 1 to 8 workers, and then the learner alone with
-1 to 16 threads; the table goes to ``load.json``. With ``--update`` the high policy's learner
-updates its networks by sb3-contrib's own pass and by the fast one; the table goes to
-``update.json``. With ``--cluster`` processes on this machine and Ray actors take turns simulating
-robots on the plane; the table goes to ``cluster.json``.
+1 to 16 threads; the table goes to ``load.json``. With ``--update`` networks of the high policy's
+default size, without encoder and mirroring, are updated by sb3-contrib's own pass and by the fast
+one; the table goes to ``update.json``. With ``--cluster`` processes on this machine and Ray actors
+take turns simulating robots on the plane; the table goes to ``cluster.json``.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.logger import Logger
 
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
-from tdgc.errors import InputError
+from tdgc.errors import InputError, what_stopped
 from tdgc.files import make_folder, write_json
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
@@ -274,7 +274,7 @@ def compare_loads(seconds: float) -> dict[str, Any]:
 
 
 def compare_updates(updates: int) -> dict[str, float]:
-    """Content of update.json: ``update_seconds`` on the default configuration."""
+    """Content of update.json: ``update_seconds`` at the default sizes."""
     config = HighTrainConfig()
     result = update_seconds(config, high_spaces(config.env), updates)
     head("update", "seconds", "ratio")
@@ -395,10 +395,11 @@ def main(arguments: list[str] | None = None) -> int:
             name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
         write_json(args.out / name, result)
     except (WorkerError, OSError) as error:
-        lines = str(error).splitlines()  # a worker's traceback is between the first and last
-        said = " ".join(dict.fromkeys((lines[0], lines[-1])))
-        print(f"tdgc.bench: {said}", file=sys.stderr)
+        print(f"tdgc.bench: {what_stopped(error)}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt as error:
+        print(f"tdgc.bench: {what_stopped(error)}", file=sys.stderr)
+        sys.exit(1)  # instead of returning, so that a caller stops, too
     return 0
 
 

@@ -1,6 +1,6 @@
 """Calibration: make a copy of a low policy that walks at the velocities it is commanded.
 
-    python -m tdgc.calibration --low runs/low/policy --out runs/low/calibrated
+    python -m tdgc.calibration --low runs/low/uncalibrated --out runs/calibrated
 
 A blind policy trained with random dynamics, pushes and penalties is slower than commanded. The
 error differs between gaits but is repeatable: on the nominal robot the mean velocity at a command
@@ -35,6 +35,7 @@ from tdgc.config import (
     LowLevelConfig,
     LowTrainConfig,
 )
+from tdgc.errors import what_stopped
 from tdgc.files import make_folder
 from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.parallel.group import TaskGroup
@@ -160,7 +161,8 @@ class ResponseModel:
 
     @policies.one_thread()
     def _fit(self, given: Array, reached: Array, rng: np.random.Generator) -> Array:
-        held = np.arange(len(given)) % 8 == 0
+        # Robots are dealt to the gaits in turn, so a whole round of gaits is held out.
+        held = np.arange(len(given)) // len(GAITS) % 8 == 0
         # A mirrored robot responds to the mirrored command with the mirrored velocity.
         sign = np.array([np.ones(NUM_COMMANDS), _SIGN])[:, None]
         command = (sign * given[~held]).reshape(-1, NUM_COMMANDS)
@@ -230,7 +232,10 @@ class Corrector:
 def training_tasks(
     config: LowLevelConfig, robots: int, seed: int, plane_share: float
 ) -> list[LowLevelTask]:
-    """The training MDP as late in a run: all commands, all levels, ``plane_share`` on a plane."""
+    """The training MDP as late in a run: all commands, all levels, ``plane_share`` on a plane.
+
+    On the plane, unlike in training, the physics is that of the tiles.
+    """
     config = dataclasses.replace(config, command_start=1.0)
     plane, tiles = (dataclasses.replace(config, terrain=ground) for ground in ("plane", "tiles"))
     task = make_task((plane, tiles), plane_share, robots, seed)
@@ -414,7 +419,14 @@ def main(arguments: list[str] | None = None) -> int:
                 raise ValueError(f"--{name} must be {least} or more, not {getattr(args, name)}")
         if not 0.0 <= args.plane_share < 1.0:
             raise ValueError(f"--plane-share must be from 0 to below 1, not {args.plane_share:g}")
+        if args.workers != "auto" and args.workers < 1:
+            raise ValueError(f"--workers must be 1 or more, not {args.workers}")
         low = load_low(args.low)[0]
+        if low.meta.get("calibration", {}).get("robots"):
+            raise ValueError(
+                f"{args.low} is calibrated already; train_low.py keeps the policy "
+                "from before as 'uncalibrated' beside it"
+            )
         make_folder(args.out.parent)
     except (ValueError, OSError) as error:
         print(f"tdgc.calibration: {error}", file=sys.stderr)
@@ -427,8 +439,11 @@ def main(arguments: list[str] | None = None) -> int:
         )
         policies.save_copy(args.out, low, student.tensors(), {**low.meta, "calibration": facts})
     except (ValueError, WorkerError, OSError) as error:
-        print(f"tdgc.calibration: {error}", file=sys.stderr)
+        print(f"tdgc.calibration: {what_stopped(error)}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
+    except KeyboardInterrupt as error:
+        print(f"tdgc.calibration: {what_stopped(error)}", file=sys.stderr)
+        sys.exit(1)  # instead of returning, so that a caller stops, too
     print(
         f"{facts['walked']:.0f} of {args.robots} robots walked; the fit predicts what commands "
         f"lead to within {facts['error_vx_m_s']:.3f} and {facts['error_vy_m_s']:.3f} m/s and "

@@ -1,5 +1,5 @@
-"""Errors about unusable input, with one-line messages, interruptions, and a check for optional
-packages."""
+"""Errors about unusable input, interruptions, one-line descriptions of both, and a check for
+optional packages."""
 
 import importlib.util
 
@@ -17,6 +17,20 @@ class InputError(ValueError):
 
 class StoppedError(Exception):
     """A signal or the time limit came before something was done."""
+
+
+def in_one_line(text: str) -> str:
+    """The first and the last line of a text: between them is a worker's traceback."""
+    lines = text.splitlines()
+    return " ".join(dict.fromkeys((lines[0], lines[-1])))
+
+
+def what_stopped(error: BaseException) -> str:
+    """Describe what ended a program in one line, with the error's notes."""
+    said = in_one_line(str(error) or type(error).__name__)  # a MemoryError may say nothing
+    if isinstance(error, KeyboardInterrupt):
+        said = f"stopped by {str(error) or 'Ctrl-C'}"
+    return "; ".join([said, *getattr(error, "__notes__", ())])
 
 
 def require(what: str, packages: tuple[str, ...], extra: str) -> None:

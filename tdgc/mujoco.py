@@ -21,11 +21,11 @@ from tdgc.benchmark import flags
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Batch, Cell, Episode, Watcher, closed_loop, plan
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import STOPS, describe, make_room, salvage, what_stopped, write_results
+from tdgc.benchmark.results import STOPS, describe, make_room, salvage, write_results
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
-from tdgc.errors import require
+from tdgc.errors import require, what_stopped
 from tdgc.files import write_json
 from tdgc.parallel.jobs import run_jobs
 from tdgc.show import film

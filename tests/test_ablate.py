@@ -17,7 +17,7 @@ from tdgc.ablate.trials import Result, Runner, Trial
 from tdgc.ablate.variants import HELPS, VARIANTS, WHOLE, Variant, variants
 from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, LowLevelConfig, with_overrides
 from tdgc.learn.recurrent import FastRecurrentPolicy
-from tdgc.learn.run import Interruption
+from tdgc.learn.run import Interruption, sole_user
 from tdgc.sim.commands import NUM_ACTIONS
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import high_mirror
@@ -329,6 +329,14 @@ def test_time_that_is_over_stops_before_a_trial(
     assert main([*TINY, "--only", "full", "--time-limit", "0", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out.endswith("stopped; run the same command to continue\n")
     assert not (tmp_path / "full-42").exists()
+
+
+def test_two_ablations_do_not_share_a_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with sole_user(tmp_path):
+        assert main([*TINY, "--only", "full", "--time-limit", "0", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == (f"tdgc.ablate: '{tmp_path}' is in use by another process\n")
 
 
 @pytest.mark.parametrize(

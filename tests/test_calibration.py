@@ -93,6 +93,15 @@ def test_a_response_is_learned_and_put_right_for_each_gait() -> None:
     assert (errors[1] < 0.35 * errors[0]).all()  # ``_PULL`` leaves a tenth or more
 
 
+def test_the_error_is_that_of_all_gaits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trot does what it is told; what the other gaits do is noise, of 0.3 m/s and rad/s."""
+    monkeypatch.setattr(calibration, "_EPOCHS", 2)
+    given, noise = commands(400, width=1.4), np.random.default_rng(2).normal(0.0, 0.3, (400, 3))
+    noise[::4] = 0.0
+    model = ResponseModel(given, given[:, :3] + noise, RANGES, seed=0)
+    np.testing.assert_allclose(model.error, 0.3 * np.sqrt(0.75), rtol=0.25)
+
+
 def test_what_cannot_be_reached_is_not_asked_for_without_end() -> None:
     """For a robot that saturates at half of each range, corrections end at 1.2 of the ranges.
 
@@ -294,6 +303,8 @@ def test_script(
         ),
         (["--low", "{0}/low", "--turns", "0"], "--turns must be 1 or more, not 0"),
         (["--low", "tdgc/pretrained/high"], "high: not a low policy of this package"),
+        (["--low", "tdgc/pretrained/low"], "low is calibrated already; train_low.py keeps"),
+        (["--low", "{0}/low", "--workers", "0"], "--workers must be 1 or more, not 0"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -197,6 +197,8 @@ def test_an_override_of_a_whole_table() -> None:
         ("env.robot.kp=twenty", "'env.robot.kp' must be of type float, not 'twenty'"),
         ("env.robot.kp=", "'env.robot.kp' must be of type float, not ''"),
         ("env.commands.vx=[1,0]", r"'env.commands.vx' must be \[low, high\] with low <= high"),
+        ("env.command_draw.leap_vx=[0.9,1.2]", "with 0 <= low <= high <= 1, not"),
+        ("env.rewards.power=-101", "'env.rewards.power' must be from -100 to 100, not -101"),
         ("env=3", "env must be a table of keys, not 3"),
         ('env={"robot": {"kq": 1}}', "unknown configuration key 'env.robot.kq'"),
     ],

@@ -215,6 +215,8 @@ def test_who_walks_blindly_into_a_trench_made_no_decision():
         assert verdict(seen) == ("execution", "lost track of velocity")
         unseen = walk("gap", outcome=outcome, track=at_lip, error_vx=-0.5, **blind)
         assert verdict(unseen) == ("decisions", "walked blindly into a trench")
+        unseen["family"][:] = "unknown"  # which tells no more than nothing
+        assert verdict(unseen) == ("decisions", "walked blindly into a trench")
         unseen["family"][:] = "gap"
         assert verdict(unseen) == verdict(seen)
     before = ((0.5, 4.0), (lip - HIPS - REACH - 0.05, 4.0))
@@ -259,6 +261,20 @@ def test_an_obstacle_of_a_map_is_the_decisions_fault(tmp_path):
     assert verdict(climbing) == ("execution", "lost its footing on the way to the goal")
     tripped = walk(path, 10, "collided", track=((0.8, 4.0), (2.5, 4.0)))
     assert verdict(tripped) == ("execution", "lost its footing on the way to the goal")
+
+
+def test_an_obstacle_of_clutter_is_not_called_a_pillar():
+    cluttered = (tile_of(0, "clutter", 6, n) for n in range(20))
+    number, (px, y, diameter) = next(
+        (n, tile.features.pillars[0])
+        for n, tile in enumerate(cluttered)
+        if len(tile.features.pillars)
+    )
+    x = px - 0.5 * diameter
+    into = walk("clutter", outcome="collided", track=((x - 1.0, y), (x - 0.25, y)))
+    hit = diagnose(dataclasses.replace(into, episode=number), HIPS)
+    assert hit.cause == "steered into an obstacle"
+    assert hit.feature == f"0.25 m from obstacle at ({px:.1f}, {y:.1f}) m"
 
 
 def test_a_pillar_in_the_way_is_the_decisions_fault():

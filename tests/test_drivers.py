@@ -29,13 +29,13 @@ from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, NUM_ACTIONS, CommandDecoder, default_command, gait_index
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.observation import observe, width
+from tdgc.sim.observation import columns, observe, width
 from tdgc.sim.robot import Array
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import GUIDANCE, SEMANTIC, HighSources, high_layout
 from tdgc.tasks.leaps import Landing
-from tdgc.tasks.pairing import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBES, height_probes
 from tdgc.tasks.teacher import Skill, toward
 
@@ -233,6 +233,33 @@ def test_commands_are_held_between_decisions(low, tmp_path):
             loco.world.state.q += 0.1  # something to react to
         changed = [not np.array_equal(a, b) for a, b in pairwise(commands)]
         assert np.flatnonzero(changed).tolist() == [4]
+    finally:
+        loco.world.close()
+
+
+class Listener:
+    """A high policy that does nothing, and keeps what it observed."""
+
+    def __init__(self):
+        self.seen = []
+
+    def predict(self, observation, state=None):
+        self.seen.append(observation)
+        return np.zeros((len(observation), NUM_ACTIONS)), None
+
+
+def test_no_time_is_left_after_the_longest_episode_of_training(low):
+    config = dataclasses.replace(paired(CONFIG, low[1]), episode_seconds=0.4)
+    loco = Locomotion(1, low[1].robot, low[1].physics, None)
+    try:
+        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+        high = Listener()
+        driver = HierarchyDriver(high, config)
+        driver.begin(loco, np.array([[6.5, 0.0]]), "rough")
+        for step in range(0, 30, config.decimation):
+            driver.command(step)
+        left = np.concatenate(high.seen)[:, columns(high_layout(config))["time_left"]]
+        np.testing.assert_allclose(left.ravel(), [1.0, 0.75, 0.5, 0.25, 0.0, 0.0], atol=1e-6)
     finally:
         loco.world.close()
 

@@ -203,18 +203,22 @@ def test_the_state_of_a_broken_worker_begins_new_episodes(fragile: TaskVecEnv) -
 # ------------------------------------------------------------------ robots
 
 
+LARGE, ENORMOUS = 2e4, 2e5  # rewards: ``Fragile`` rewards an action with its number
+
+
 def test_robots_that_blow_up_never_reach_the_learner() -> None:
     """A robot with a huge value ends alone; a NaN or an infinity rebuilds the world."""
     env = TaskVecEnv(Fragile, 3, 1, seed=0, spaces=SPACES)
     seed, count = worker_seed(0, 0), 2
     env.reset()
-    for fault in (NAN_SEEN, NAN_EARNED, INFINITE, FAR):
-        seen, *_ = step(env, actions(3))
+    for fault in (NAN_SEEN, NAN_EARNED, INFINITE, FAR, ENORMOUS):
+        seen, rewards, *_ = step(env, actions(3, r0=LARGE))
+        assert rewards[0] == LARGE  # which a large weight may cause
         obs, rewards, dones, infos = step(env, actions(3, r1=fault))
         assert rewards.tolist() == [1.0, 0.0, 1.0]
         np.testing.assert_array_equal(infos[1]["terminal_observation"], seen[1])
         level, steps = seen[0, 1] + 1, seen[0, 2] + 1
-        if fault == FAR:
+        if fault in (FAR, ENORMOUS):
             assert dones.tolist() == [False, True, False]
             assert obs[:, 2].tolist() == [steps, 0.0, steps]
         else:
@@ -224,7 +228,7 @@ def test_robots_that_blow_up_never_reach_the_learner() -> None:
                 assert infos[i]["terminal_observation"][:3].tolist() == [i, level, steps]
         assert all(infos[i]["TimeLimit.truncated"] for i in np.flatnonzero(dones))
         assert (obs[:, 1] == level).all() and (obs[:, 3] == drawn(seed, count)).all()
-    assert [sums["blow_ups"] for sums in (*env.stats(), *env.stats())] == [4.0, 0.0]
+    assert [sums["blow_ups"] for sums in (*env.stats(), *env.stats())] == [5.0, 0.0]
     env.close()
 
 

@@ -116,6 +116,13 @@ def test_settings_for_another_robot(a1: RobotConfig, robot: RobotConfig) -> None
     assert fitted(robot)["kp"] == pytest.approx(20.0 * 15.4 / 12.6 * 0.5 / 0.426, abs=0.05)
 
 
+def test_the_gains_of_a_light_robot_are_not_rounded_to_zero(tmp_path: Path) -> None:
+    masses = {f'mass value="{m}"': f'mass value="{m / 300:.6f}"' for m in (0.2, 0.6, 0.95, 5.6)}
+    found = fitted(changed(tmp_path, *masses.items()))
+    assert found["kp"] == pytest.approx(20.0 / 300, rel=0.01)
+    assert found["kd"] == pytest.approx(0.6 / 300, rel=0.01)
+
+
 def test_a_urdf_that_says_nothing_of_its_motors(tmp_path: Path) -> None:
     hips_and_thighs, calves = (' effort="23.7" velocity="30"', ""), (' effort="35.5"', "")
     silent = changed(tmp_path, hips_and_thighs, calves, (' velocity="20"', ""))

@@ -17,6 +17,7 @@ from tdgc.config import (
     HighLevelConfig,
     HighRewardConfig,
     HighTrainConfig,
+    LowLevelConfig,
     RobotConfig,
     with_overrides,
 )
@@ -577,6 +578,27 @@ def test_families_are_dealt_to_the_robots_of_the_run():
     env.reset(seed=6)
     assert env.unwrapped.task.tiles.families == ("gap",)
     env.close()
+
+
+@pytest.mark.parametrize("name", ["tdgc/Navigation-v0", "tdgc/LowLevel-v0"])
+def test_environments_refuse_what_is_kept_for_evaluation(name):
+    config = HighLevelConfig() if "Navigation" in name else LowLevelConfig(terrain="tiles")
+    for change, message in (
+        ({"levels": 13}, "'env.levels' must be from 1 to 11, not 13"),
+        ({"families": ("mixed",)}, "must not name 'mixed'"),
+        ({"families": ()}, "must name at least one terrain family"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            gym.make(name, config=dataclasses.replace(config, **change))
+
+
+def test_a_large_seed_is_as_good_as_a_small_one():
+    env = gym.make("tdgc/Navigation-v0")
+    first, _ = env.reset(seed=2**70)
+    again, _ = env.reset(seed=2**70)
+    other, _ = env.reset(seed=2**70 + 1)
+    env.close()
+    assert (first == again).all() and (first != other).any()
 
 
 def test_gymnasium_and_sb3_accept_it():

@@ -1,5 +1,7 @@
 """Leaps: planned landings over trenches, and the measured landing of a low policy."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -192,11 +194,14 @@ def test_price_of_a_stride_on_flat_ground() -> None:
 
 def test_the_command_of_a_leap() -> None:
     command = np.tile(np.arange(15.0), (2, 1))
-    leap_command(command, [2.2, 2.4], 0.36)
+    leap_command(command, [2.2, 2.4], 0.36, CommandRanges())
     assert command[:, 4].tolist() == [2.2, 2.4] and command[:, 10].tolist() == [0.36] * 2
     assert command[:, 6].tolist() == [0.07] * 2
     assert command[:, 12:].tolist() == [[0.0, 0.0, 0.0]] * 2  # pronk
     assert command[0, :4].tolist() == [0.0, 1.0, 2.0, 3.0]
+    narrow = dataclasses.replace(CommandRanges(), swing_height=(0.08, 0.24), duration=(0.4, 0.5))
+    leap_command(command, 2.2, 0.36, narrow)
+    assert command[0, 5:7].tolist() == [0.5, 0.08]
 
 
 def test_landing_of_the_shipped_low_policy() -> None:

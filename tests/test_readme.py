@@ -165,7 +165,7 @@ READ = (
     "python evaluate.py --gui",
     "python evaluate.py --gui watch --families stair --levels 6",
     "python train_high.py --preset paper --out runs/paper",
-    "python -m tdgc.calibration --low runs/low/policy --out runs/calibrated",
+    "python -m tdgc.calibration --low runs/low/uncalibrated --out runs/calibrated",
     "OMP_NUM_THREADS=1 python train_low.py --workers 1",
     "python -m tdgc.ablate --out runs/ablation",
     "python -m tdgc.diagnose run.npz --export runs/export --outcome fell",
@@ -387,6 +387,7 @@ def test_conditions_are_the_benchmarks() -> None:
         ("evaluate.md", None, evaluate.main),
         ("deploy.md", "Export", export.main),
         ("scaling.md", "Measure it", bench.main),
+        ("experiments.md", "What matters", ablate.main),
     ],
 )
 def test_flags_are_the_scripts(
@@ -395,7 +396,7 @@ def test_flags_are_the_scripts(
     main: Callable[[list[str]], int],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert column(tables(name, heading)[0]) == flags(main, capsys)
+    assert flags(main, capsys) in [column(table) for table in tables(name, heading)]
 
 
 def test_both_trainers_take_the_same_flags(capsys: pytest.CaptureFixture[str]) -> None:

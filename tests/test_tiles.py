@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tdgc.sim.terrain import Tile, make_tile, tile_rng
-from tdgc.tasks.tiles import FLAT, TrainingTiles, check_families
+from tdgc.tasks.tiles import FLAT, TrainingTiles, check_families, left_out
 
 FAMILIES = ("stair", FLAT, "rough")
 ALL = np.arange(3)
@@ -65,6 +65,11 @@ def test_numbers_are_enough_to_draw_the_tiles_again() -> None:
     for a, b in ((tiles, other), (other, tiles)):
         assert a.begin(np.array([2]), LEVELS).tolist() == []
         assert (a.state_dict()["number"] == b.state_dict()["number"]).all()
+
+
+def test_with_few_robots_families_are_left_out() -> None:
+    families = ("stair", "stair", "gap", "tilt")
+    assert [left_out(families, n) for n in (2, 3, 4)] == [["gap", "tilt"], ["tilt"], []]
 
 
 def test_mixed_is_kept_for_evaluation() -> None:

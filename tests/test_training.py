@@ -45,7 +45,7 @@ from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.imitation import TaughtPolicy
 from tdgc.learn.ppo import LinearRate, NoiseScaledRate
-from tdgc.learn.run import Interruption, append_line, drop_rows_after, tensorboard_logger
+from tdgc.learn.run import Interruption, Run, append_line, drop_rows_after, tensorboard_logger
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
 from tdgc.parallel.worker import ProcessLink
@@ -183,6 +183,8 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(damage: Any, tmp_path
     assert Checkpoint.newest(tmp_path, warnings.append).header["at"] == 10
     assert len(warnings) == 1 and str(newest) in warnings[0]
     assert warnings[0].endswith("; trying the one before")
+    Checkpoint.read(before).drop_later(tmp_path / "checkpoints")  # as when a run goes on from it
+    assert sorted(newest.parent.glob("step-*")) == [before]
     damage(before)
     with pytest.raises(CheckpointError, match=r"no checkpoint that can be read$"):
         Checkpoint.newest(tmp_path, warnings.append)
@@ -290,6 +292,26 @@ def test_time_limit() -> None:
     assert over.due() and over.reason == "the time limit"
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.parametrize(("trainer", "flags"), [(train_low, []), (train_high, ["--no-teacher"])])
+def test_a_second_ctrl_c_is_one_line(
+    trainer: Any,
+    flags: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def train(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Run, "train", train)
+    with pytest.raises(SystemExit) as ended:  # so that an ablation ends, too
+        trainer.main([*flags, "--out", str(tmp_path)])
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    assert said.splitlines()[-1] == f"{trainer.__name__}.py: stopped by Ctrl-C"
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -634,6 +656,10 @@ def test_calibration_ends_a_run_of_the_low_policy(
     assert train_low.main(again) == 2
     said = "policy is already calibrated, with 'calibration.turns' 1, not 2; python -m"
     assert said in "".join(capfd.readouterr())
+    without = ["--resume", "--set", "calibration.robots=0", "--out", str(later)]
+    assert train_low.main(without) == 2
+    said = f"{later / 'policy'} is already calibrated; without, it is {later / 'uncalibrated'}\n"
+    assert said in "".join(capfd.readouterr())
 
 
 def test_faults_of_a_run(
@@ -734,6 +760,7 @@ def test_flags_and_folders_that_cannot_be_used(
         ],
         "'calibration.robots' must be 0 or at least 64": ["--set", "calibration.robots=63"],
         "--worker-timeout must be above 0 and at most 86400, not inf": ["--worker-timeout", "inf"],
+        "--time-limit must be at least 0 s, not nan": ["--time-limit", "nan"],
         "terrain 'no.npy' cannot be read as a NumPy": ["--set", 'env.families=["flat","no.npy"]'],
     }
     for message, arguments in cases.items():
@@ -742,10 +769,17 @@ def test_flags_and_folders_that_cannot_be_used(
         error = capsys.readouterr().err
         assert error.startswith("train_low.py: ") and message in error
         assert error.count("\n") == 1
+    assert train_high.main(["--resume", "--out", str(used)]) == 2
+    said = f"train_high.py: --resume: '{used}' holds a run of train_low.py\n"
+    assert capsys.readouterr().err == said
     for setting, message in (
         ('env.families=["sand"]', "unknown terrain family 'sand'; choose from flat, rough, "),
         ("env.first_level=3", "'env.first_level' and 'env.first_levels' have no effect with imi"),
         ("env.window=8", "threshold must be above (window + 1) / 2 and at most window, not 3 with"),
+        (
+            "imitation.teacher.leap_speed=2",
+            "'imitation.teacher.leap_speed' must be from -1 to 1.2, not 2",
+        ),
         (
             "env.first_levels=20",
             "'env.first_level' and 'env.first_levels' must add up to at most 11 levels, not 20",
@@ -783,6 +817,9 @@ def test_flags_and_folders_that_cannot_be_used(
     ):
         assert train_high.main(["--set", setting, "--out", str(empty)]) == 2
         assert capsys.readouterr().err.startswith(f"train_high.py: {message}")
+    drawn = ["--no-teacher", "--set", "env.curriculum=uniform", "--set", "env.first_level=3"]
+    assert train_high.main([*drawn, "--out", str(empty)]) == 2
+    assert "have no effect with env.curriculum uniform" in capsys.readouterr().err
     alone = ["--set", "ppo.lstm=null"]
     assert train_high.main([*alone, "--out", str(empty)]) == 2
     assert "'ppo.encoder' must be [] if 'ppo.lstm' is null" in capsys.readouterr().err

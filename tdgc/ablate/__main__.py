@@ -27,6 +27,7 @@ from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError, StoppedError
 from tdgc.files import write_json, write_text
+from tdgc.learn.run import sole_user
 from tdgc.parallel.cores import workers_flag
 from tdgc.show import plots
 from tdgc.sim.terrain import EDITION, family_number, is_map
@@ -234,8 +235,12 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     trials = plan(chosen, seeds)
     try:
-        found, finished = conduct(runner, trials, common, tiles)
-        print(report(args.out, common, tiles, trials, found))
+        with sole_user(args.out):
+            found, finished = conduct(runner, trials, common, tiles)
+            print(report(args.out, common, tiles, trials, found))
+    except InputError as error:  # another ablation runs in the folder
+        print(f"tdgc.ablate: {error}", file=sys.stderr)
+        return 2
     except OSError as error:  # finished trials stay in their folders
         print(f"tdgc.ablate: {error}", file=sys.stderr)
         return 1

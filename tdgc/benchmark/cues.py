@@ -210,5 +210,5 @@ class CuesLaw:
             commanded = np.full(len(rows), min(self._leap_speed, self._ranges.vx[1]))
             stride = before[rows][:, STRIDE_COMMANDS].T
             motion = Motion(x[rows], speed[rows], commanded, clock, *stride)
-            leap_command(leaps, *memory.plan.steps(rows, motion, landing))
+            leap_command(leaps, *memory.plan.steps(rows, motion, landing), self._ranges)
             memory.command[rows] = leaps

@@ -26,7 +26,17 @@ from tdgc.benchmark.evaluation import Episode, EpisodeRecord
 from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
 from tdgc.files import atomic
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import CELL, GOAL_BEGIN, MAX_LEVEL, START_END, TILE_SIZE, ZONE, Tile, is_map
+from tdgc.sim.terrain import (
+    CELL,
+    GOAL_BEGIN,
+    MAX_LEVEL,
+    START_END,
+    TILE_SIZE,
+    UNNAMED,
+    ZONE,
+    Tile,
+    is_map,
+)
 
 LAYERS = ("decisions", "execution", "terrain")
 
@@ -159,7 +169,7 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
     # robot did not hit the ground.
     tripped = trace.outcome == "collided" and tile is not None and not held[-1]
     down = trace.outcome == "fell" or tripped
-    obstacle = "an obstacle" if tile is None or is_map(trace.family) else "a pillar"
+    obstacle = "an obstacle" if tile is None else _obstacle(tile.family)
     if trace.family == "mixed" or trace.level > MAX_LEVEL:
         blamed = "terrain", "never trained on"
     elif towards < -AWAY:
@@ -235,7 +245,7 @@ def asked_towards(trace: Trace, intervals: NDArray[np.bool_]) -> float:
 
 def has_looked(trace: Trace) -> bool:
     """Whether the decisions were based on any terrain cue."""
-    told = any(family is not None for family in trace["family"])
+    told = any(family not in (None, "unknown") for family in trace["family"])
     return told or bool(np.isfinite(trace["probe_00"]).any())
 
 
@@ -317,7 +327,13 @@ def features(tile: Tile, x: float, y: float) -> Iterator[tuple[str, float]]:
     if len(found.pillars):
         away = to_pillars(tile, x, y)
         px, py, _ = found.pillars[away.argmin()]
-        yield f"pillar at ({px:.1f}, {py:.1f}) m", float(away.min())
+        name = _obstacle(tile.family).split()[1]
+        yield f"{name} at ({px:.1f}, {py:.1f}) m", float(away.min())
+
+
+def _obstacle(family: str) -> str:
+    """What a family's obstacles are called, with its article; some of Clutter are walls or pits."""
+    return "an obstacle" if family in UNNAMED or is_map(family) else "a pillar"
 
 
 def to_trenches(tile: Tile, x: ArrayLike) -> Array:

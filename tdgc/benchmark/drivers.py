@@ -190,7 +190,8 @@ class HierarchyDriver(Driver):
             self._observer.measure(self._goal)
         if self.config.cues in ("both", "geometric"):
             self.probes = self._observer.probes.read()
-        share = np.full(len(rows), decision / self._horizon)
+        # A policy trained on shorter episodes than those of an evaluation has no time left then.
+        share = np.full(len(rows), min(decision / self._horizon, 1.0))
         return self._observer.observe(self._goal, share, self._last, self._families)
 
 

@@ -141,6 +141,12 @@ class EpisodeRecord:
         where = f"{self.policy}_{self.condition}_{file_label(self.family)}"
         return f"{where}_{self.level:02d}_{self.episode:03d}"
 
+    @property
+    def strip(self) -> str:
+        """Name of the picture that shows all policies on the tile."""
+        suffix = "" if self.condition == "nominal" else f"_{self.condition}"
+        return f"strip_{file_label(self.family)}_{self.level}{suffix}.png"
+
 
 @dataclass(frozen=True, eq=False)
 class Episode(EpisodeRecord):

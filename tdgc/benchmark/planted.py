@@ -32,8 +32,10 @@ from tdgc.benchmark.diagnosis import (
 )
 from tdgc.benchmark.drivers import BaselineDriver, Decides, Driver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Cell, run_cell
+from tdgc.benchmark.results import STOPS
 from tdgc.benchmark.trace import Trace, Tracer
-from tdgc.config import HighLevelConfig
+from tdgc.config import HighLevelConfig, LowLevelConfig
+from tdgc.errors import what_stopped
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX
 from tdgc.sim.geometry import read_geometry
@@ -197,6 +199,24 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"tdgc.benchmark.planted: {error}", file=sys.stderr)
         return 2
+    try:
+        count_blames(low, low_config, pair, hips)
+    except STOPS as error:
+        print(f"tdgc.benchmark.planted: {what_stopped(error)}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def count_blames(
+    low: Policy, low_config: LowLevelConfig, pair: tuple[Policy, HighLevelConfig], hips: float
+) -> None:
+    """Print how often the right layer is blamed, and the pair's tracking errors without a fault.
+
+    Args:
+        low, low_config: the low policy and its MDP.
+        pair: the high policy and its MDP.
+        hips: m, distance of the hips ahead of the trunk's centre.
+    """
     print("fault".ljust(38) + "layer".ljust(11) + "".join(f"{name:>9}" for name in FAMILIES))
     right = total = 0
     for fault in FAULTS:
@@ -224,7 +244,6 @@ def main(arguments: list[str] | None = None) -> int:
             f"{name.ljust(11)}{stretch:>6.2f} {limit.unit:<5}{limit.stretch:>8.2f}"
             f"{episode:>6.2f} {limit.unit:<5}{limit.episode:>8.2f}"
         )
-    return 0
 
 
 if __name__ == "__main__":

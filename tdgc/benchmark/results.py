@@ -268,11 +268,3 @@ def salvage(
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt(signal.Signals(number).name)
-
-
-def what_stopped(error: BaseException) -> str:
-    """Describe what ended an evaluation in one line, with its notes."""
-    said = str(error) or type(error).__name__  # a MemoryError may say nothing
-    if isinstance(error, KeyboardInterrupt):
-        said = f"stopped by {str(error) or 'Ctrl-C'}"
-    return "; ".join([said, *getattr(error, "__notes__", ())])

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from tdgc.config.settings import Count, NotNegative, Positive, Share, Whole
+from tdgc.config.settings import Count, NotNegative, Positive, Share, Weight, Whole
 from tdgc.config.sim import CommandRanges, RandomisationConfig
 
 
@@ -19,23 +19,23 @@ class HighRewardConfig:
 
     step_time_scaling: bool = field(default=True, metadata={"before": True})
 
-    goal_distance: float = 1.0
-    face: float = 0.2
-    arrive: float = 2.0
-    stable: float = 0.5
-    action_rate: float = -0.01
-    command_rate: float = -0.2
-    command_acceleration: float = -0.1
-    contact_force: float = -0.01
-    laziness: float = -0.5
-    alive: float = 0.1
+    goal_distance: Weight = 1.0
+    face: Weight = 0.2
+    arrive: Weight = 2.0
+    stable: Weight = 0.5
+    action_rate: Weight = -0.01
+    command_rate: Weight = -0.2
+    command_acceleration: Weight = -0.1
+    contact_force: Weight = -0.01
+    laziness: Weight = -0.5
+    alive: Weight = 0.1
     map_radius: Positive = 8.0  # m, R_map: the tile's length
-    curve_gain: float = 1.0  # a of the goal distance
-    curve_rate: float = 3.0  # b of the goal distance
+    curve_gain: Weight = 1.0  # a of the goal distance
+    curve_rate: Positive = 3.0  # b of the goal distance
     goal_radius: Positive = 0.5  # m, d_0: the paper's reach distance
-    arrive_base: float = 1.0  # b_0
-    arrive_speed: float = 2.0  # b_1: bonus for arriving early
-    joint_speed_weight: float = 0.05  # beta of eta_t
+    arrive_base: Weight = 1.0  # b_0
+    arrive_speed: Weight = 2.0  # b_1: bonus for arriving early
+    joint_speed_weight: NotNegative = 0.05  # beta of eta_t
     height_scale: Positive = 0.01  # m^2, sigma_z
     force_threshold: float = 1.0  # N, F_th
     lazy_speed: float = 0.1  # m/s, v_th

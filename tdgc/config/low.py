@@ -4,7 +4,16 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
-from tdgc.config.settings import Count, GaitShares, NotNegative, Positive, Range, Share
+from tdgc.config.settings import (
+    Count,
+    GaitShares,
+    NotNegative,
+    Positive,
+    Range,
+    Share,
+    SharesRange,
+    Weight,
+)
 from tdgc.config.sim import CommandRanges, PhysicsConfig, RandomisationConfig, RobotConfig
 
 
@@ -17,30 +26,30 @@ class LowRewardConfig:
     multiplied by the commanded ``power_weight``.
     """
 
-    track_lin_vel: float = 2.0
-    track_yaw_rate: float = 1.5
-    body_height: float = -14.0
-    orientation: float = -4.0
-    raibert_foothold: float = -10.0
-    swing_height: float = -30.0
-    swing_contact_force: float = -8.0
-    stance_foot_speed: float = -4.0
-    target_rate: float = -0.1
-    target_acceleration: float = -0.1
-    action_rate: float = -0.01
-    foot_slip: float = -0.04
-    leg_collision: float = -3.0
-    joint_limits: float = -6.0
-    vertical_velocity: float = -0.02
-    tilt_rate: float = -0.001
+    track_lin_vel: Weight = 2.0
+    track_yaw_rate: Weight = 1.5
+    body_height: Weight = -14.0
+    orientation: Weight = -4.0
+    raibert_foothold: Weight = -10.0
+    swing_height: Weight = -30.0
+    swing_contact_force: Weight = -8.0
+    stance_foot_speed: Weight = -4.0
+    target_rate: Weight = -0.1
+    target_acceleration: Weight = -0.1
+    action_rate: Weight = -0.01
+    foot_slip: Weight = -0.04
+    leg_collision: Weight = -3.0
+    joint_limits: Weight = -6.0
+    vertical_velocity: Weight = -0.02
+    tilt_rate: Weight = -0.001
     # Our own, with twice the weight of ``orientation``. Hopping on all four feet at once is
     # unstable in pitch: two of three low policies learned a pronk in which, above 0.9 m/s, the
     # trunk pitched nose down by up to 0.5 rad at every other landing (docs/experiments.md).
-    nodding: float = field(default=-8.0, metadata={"before": 0.0})
-    joint_torques: float = -1e-4
-    joint_speeds: float = -1e-4
-    joint_accelerations: float = -2.5e-7
-    power: float = -1.0
+    nodding: Weight = field(default=-8.0, metadata={"before": 0.0})
+    joint_torques: Weight = -1e-4
+    joint_speeds: Weight = -1e-4
+    joint_accelerations: Weight = -2.5e-7
+    power: Weight = -1.0
     # sigma_lin, sigma_yaw of the paper. Walk These Ways has 0.25 for both, with weights of 1 and
     # 0.5; with those the policy walked at only 0.3-0.8 of the commanded velocity.
     sigma_lin: Positive = 0.1  # m^2/s^2
@@ -68,8 +77,8 @@ class CommandDrawConfig:
     # feet land on the same lines and a trench fits between two of these. Among uniform draws such
     # commands are too rare: commanded 0.86 m/s at 2 Hz, the robot reached 0.5 m/s.
     leaps: Share = 0.05
-    leap_vx: Range = (0.85, 1.0)  # shares of the range: 0.9-1.2 m/s
-    leap_frequency: Range = (0.0, 0.375)  # shares of the range: 2-2.75 Hz
+    leap_vx: SharesRange = (0.85, 1.0)  # shares of the range: 0.9-1.2 m/s
+    leap_frequency: SharesRange = (0.0, 0.375)  # shares of the range: 2-2.75 Hz
     # Of free commands that repeat one at which a robot fell. Most commands cause no fall, so those
     # still to be learned are rare in uniform draws: a third of the robots that walked backward in a
     # slow trot fell within six seconds.

@@ -21,9 +21,11 @@ from tdgc.errors import InputError
 Range = typing.Annotated[tuple[float, float], "[low, high] with low <= high"]
 PositiveRange = typing.Annotated[tuple[float, float], "[low, high] with 0 < low <= high"]
 ShareRange = typing.Annotated[tuple[float, float], "[low, high] with 0 < low <= high < 1"]
+SharesRange = typing.Annotated[tuple[float, float], "[low, high] with 0 <= low <= high <= 1"]
 Share = typing.Annotated[float, "from 0 to 1"]
 Positive = typing.Annotated[float, "above 0"]
 NotNegative = typing.Annotated[float, "at least 0"]
+Weight = typing.Annotated[float, "from -100 to 100"]
 Whole = typing.Annotated[int, "at least 0"]
 Count = typing.Annotated[int, "at least 1"]
 #: Shares of trot, pronk, pace and bound.
@@ -33,9 +35,11 @@ _HOLDS: dict[Any, Callable[[Any], bool]] = {
     Range: lambda bounds: bounds[0] <= bounds[1],
     PositiveRange: lambda bounds: 0.0 < bounds[0] <= bounds[1],
     ShareRange: lambda bounds: 0.0 < bounds[0] <= bounds[1] < 1.0,
+    SharesRange: lambda bounds: 0.0 <= bounds[0] <= bounds[1] <= 1.0,
     Share: lambda share: 0.0 <= share <= 1.0,
     Positive: lambda number: number > 0.0,
     NotNegative: lambda number: number >= 0.0,
+    Weight: lambda weight: -100.0 <= weight <= 100.0,
     Whole: lambda number: number >= 0,
     Count: lambda number: number >= 1,
     GaitShares: lambda shares: math.isclose(sum(shares), 1.0),

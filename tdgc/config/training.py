@@ -67,7 +67,7 @@ class LowTrainConfig:
 class RecurrentPPOConfig:
     """RecurrentPPO and the networks of the high policy.
 
-    From ``n_steps`` to ``max_grad_norm``, values are those of the paper's table.
+    From ``n_steps`` to ``ent_coef``, values are those of the paper's table.
     """
 
     # With a standard deviation of 0.1 in all actions, two fifths of the samples were clipped at

@@ -149,6 +149,13 @@ class Checkpoint:
             shutil.rmtree(old)
         return final
 
+    def drop_later(self, folder: Path) -> None:
+        """Delete damaged checkpoints in ``folder`` that are later than this one: they would count
+        as the newest when the next is saved."""
+        for path in folder.glob("step-*"):
+            if path.name > f"step-{self.steps:012d}":
+                shutil.rmtree(path)
+
     def restore(self, model: BaseAlgorithm) -> None:
         """Restore ``model`` and the global random states.
 

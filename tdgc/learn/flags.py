@@ -2,7 +2,7 @@
 
 import argparse
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch as th
 
@@ -22,6 +22,7 @@ from tdgc.parallel.worker import MakeLink, ProcessLink
 
 _LONGEST = 86400.0  # s, of a worker's silence: one day; waiting on a pipe overflows at 25 days
 TrainConfig = TypeVar("TrainConfig", LowTrainConfig, HighTrainConfig)
+_TRAINERS = {LowTrainConfig: "train_low.py", HighTrainConfig: "train_high.py"}
 
 
 class Machine(NamedTuple):
@@ -100,16 +101,22 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
             f"--worker-timeout must be above 0 and at most {_LONGEST:g}, "
             f"not {args.worker_timeout:g}"
         )
+    if args.time_limit is not None and not args.time_limit >= 0.0:
+        raise ConfigError(f"--time-limit must be at least 0 s, not {args.time_limit:g}")
     check_device(args.device)
     if args.resume:
         if args.init is not None:
             raise ConfigError("--resume keeps the run's policy: no --init")
         if not stored.is_file():
             raise ConfigError(f"--resume: no run in '{args.out}' (config.json is missing)")
+        table = read_json(stored)
         try:
-            config = recorded(type(config), read_json(stored), stored)
+            config = recorded(type(config), table, stored)
             seed = config.seed
         except ConfigError as error:
+            for other, script in _TRAINERS.items():
+                if _fits(other, table):
+                    raise ConfigError(f"--resume: '{args.out}' holds a run of {script}") from None
             raise ConfigError(
                 f"{error}; a run of another version cannot be resumed: start one in another "
                 f"folder, with --init {args.out / 'policy'} to begin from its policy"
@@ -133,6 +140,15 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
     if config.workers > config.n_envs:
         raise ConfigError(f"workers must be 1 to the {config.n_envs} robots, not {config.workers}")
     return config
+
+
+def _fits(kind: type[LowTrainConfig] | type[HighTrainConfig], table: Any) -> bool:
+    """Whether ``table`` is a whole configuration of this kind."""
+    try:
+        recorded(kind, table, "")
+    except ConfigError:
+        return False
+    return True
 
 
 def make_run_folder(out: Path) -> None:

@@ -198,6 +198,7 @@ class Run:
             write_json(self.folder / "config.json", to_dict(self.config))
             if last is not None:
                 drop_rows_after(last.steps, self.folder / "log.jsonl")
+                last.drop_later(self.folder / "checkpoints")
             # The latest observations, which SB3 otherwise keeps from the previous rollout.
             model._last_obs, model._last_episode_starts = env.seen(), env.starts()
             model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
@@ -432,7 +433,6 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
     Raises:
         WorkerError: too many worker faults; the learner is as it was after the last update.
     """
-    model._total_timesteps = until
     callback.init_callback(model)
     callback.on_training_start(locals(), globals())
     updated_at = model.num_timesteps

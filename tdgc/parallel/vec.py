@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
+from tdgc.errors import in_one_line
 from tdgc.parallel.worker import (
     Arrays,
     Beginning,
@@ -49,9 +50,9 @@ class Fault:
     seed: int
 
     def __str__(self) -> str:
-        lines = self.reason.splitlines()
-        reason = " ".join(dict.fromkeys((lines[0], lines[-1])))
-        return f"{reason}; restarted with seed {self.seed} (restart {self.restarts})"
+        return (
+            f"{in_one_line(self.reason)}; restarted with seed {self.seed} (restart {self.restarts})"
+        )
 
 
 def worker_seed(seed: int, worker: int, restarts: int = 0) -> int:

@@ -31,9 +31,12 @@ from numpy.typing import NDArray
 
 from tdgc.state import State
 
-#: Observations and rewards are scaled to order one; a robot with larger ones has blown up. For the
-#: low policy the limit is 50 m/s, 400 rad/s or 10 m above the ground.
-SANE = 100.0
+#: Observations are scaled to order one; a robot with larger ones has blown up. For the low policy
+#: the limit is 50 m/s, 400 rad/s or 10 m above the ground.
+SANE_OBSERVATION = 100.0
+#: Likewise for rewards, which are of order one at the default weights; with the largest weights
+#: (``tdgc.config.settings.Weight``) they come to a few ten thousand.
+SANE_REWARD = 1e5
 
 
 class Task(Protocol):
@@ -150,6 +153,12 @@ class Beginning(NamedTuple):
 MakeLink = Callable[[int, Arrays, Beginning], Link]
 
 
+def are_sane(obs: NDArray[np.floating], reward: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which robots have not blown up, (M,), by their observations (M, n) and rewards (M,)."""
+    within = (np.abs(obs) <= SANE_OBSERVATION).all(axis=1)  # false for NaN, too
+    return np.asarray(within & (np.abs(reward) <= SANE_REWARD))
+
+
 def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
     """Step a worker's robots, reset those whose episodes ended, and return how many blew up.
 
@@ -161,7 +170,7 @@ def _step(task: Task, views: dict[str, NDArray[Any]]) -> int:
     """
     reward, terminated, truncated = task.step(views["actions"])
     obs = task.observe()
-    blown = ~((np.abs(obs) <= SANE).all(axis=1) & (np.abs(reward) <= SANE))
+    blown = ~are_sane(obs, reward)
     # A NaN in one robot corrupts Bullet's broad phase permanently: the other robots of its client
     # fall through the ground. So the worlds are rebuilt, which ends every episode in them.
     poisoned = not (np.isfinite(obs).all() and np.isfinite(reward).all())

@@ -26,7 +26,7 @@ from tdgc.show.plots import DESIRED, GAIT_COLOURS, MEASURED, POLICY_COLOURS, she
 from tdgc.sim.commands import CONTINUOUS, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import TILE_SIZE, Tile, TileField, file_label
+from tdgc.sim.terrain import TILE_SIZE, Tile, TileField
 from tdgc.sim.world import Stage
 from tdgc.tasks.rules import GOAL_RADIUS
 
@@ -309,8 +309,6 @@ def moments(recording: Recording) -> list[int]:
 def strip(recordings: Sequence[Recording], folder: Path) -> Path:
     """Write a film strip of one tile, with a row per policy, and return its path.
 
-    Its name is ``strip_<family>_<level>.png``; a condition other than nominal is appended.
-
     Raises:
         ValueError: recordings of different tiles.
         OSError: the file cannot be written.
@@ -345,8 +343,7 @@ def strip(recordings: Sequence[Recording], folder: Path) -> Path:
                 )
                 time = f"{(i + 1) * r.dt:.1f} s"
                 draw.text((x + _SHOT[0] - 36, y + 19), time, _INK, _font(14), "mm")
-    suffix = "" if first.condition == "nominal" else f"_{first.condition}"
-    path = folder / f"strip_{file_label(first.family)}_{first.level}{suffix}.png"
+    path = folder / first.strip
     with atomic(path) as partial:
         image.save(partial, format="PNG")
     return path

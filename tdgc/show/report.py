@@ -21,7 +21,7 @@ from tdgc.benchmark.diagnosis import LAYERS, count_failures
 from tdgc.benchmark.evaluation import CONDITIONS, EpisodeRecord
 from tdgc.benchmark.results import EDITIONS, PAIRED, SIDES, policies_of, verdict
 from tdgc.files import write_text
-from tdgc.sim.terrain import file_label, is_map
+from tdgc.sim.terrain import is_map
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
 NAME = "report.html"
@@ -139,11 +139,16 @@ def _tuning(path: Path) -> dict[str, Any] | None:
     return {"changes": list(_flat(found["tuning"])), "effect": found["effect"]}
 
 
-def film_stem(row: Row) -> str:
-    """Name of the films for a row of episodes.csv or diagnosis.csv."""
+def record_of(row: Row) -> EpisodeRecord:
+    """The record in a row of episodes.csv or diagnosis.csv."""
     level, episode, seed = (int(row[key]) for key in ("level", "episode", "seed"))
     where = row["policy"], row["condition"], row["family"]
-    return EpisodeRecord(*where, level, episode, seed, row["outcome"]).name
+    return EpisodeRecord(*where, level, episode, seed, row["outcome"])
+
+
+def film_stem(row: Row) -> str:
+    """Name of the films for a row of episodes.csv or diagnosis.csv."""
+    return record_of(row).name
 
 
 def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> dict[str, Any]:
@@ -184,8 +189,7 @@ def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> l
                 films.append(film)
                 if film["uri"]:
                     room -= (folder / film["file"]).stat().st_size
-        suffix = "" if first["condition"] == "nominal" else f"_{first['condition']}"
-        strip = folder / f"strip_{file_label(family)}_{first['level']}{suffix}.png"  # of episode 0
+        strip = folder / record_of(first).strip  # of episode 0
         shown = first["episode"] == "0" and strip.is_file()
         tiles.append({**first, "films": films, "strip": data_uri(strip) if shown else None})
     return tiles

@@ -80,8 +80,8 @@ def fitted(config: RobotConfig) -> dict[str, Any]:
     found: dict[str, Any] = {
         "base_height": round(height * ours.base_height, 2),
         "stance": tuple(stance.round(2).tolist()),
-        "kp": round(mass * length * ours.kp, 1),
-        "kd": round(mass * length**1.5 * ours.kd, 2),
+        "kp": float(f"{mass * length * ours.kp:.3g}"),
+        "kd": float(f"{mass * length**1.5 * ours.kd:.2g}"),
     }
     for name, limits in zip(("torque_limit", "speed_limit"), own.motor_limits, strict=True):
         known = np.isfinite(limits)

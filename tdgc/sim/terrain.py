@@ -36,7 +36,8 @@ EDITION = 2
 FAMILIES = ("rough", "pillar", "stair", "gap", "tilt")
 #: Training families outside the benchmark: many kinds of ground without a name of their own, and
 #: the same with trenches before or behind it.
-UNNAMED = CLUTTER, DITCHES = "clutter", "ditches"
+CLUTTER, DITCHES = "clutter", "ditches"
+UNNAMED = (CLUTTER, DITCHES)
 ALL_FAMILIES = (*FAMILIES, "mixed", *UNNAMED)
 #: A family name with this ending is the path of a user's height map, see ``height_map``.
 MAP_ENDING = ".npy"

@@ -57,7 +57,7 @@ class Crossings:
 
     Attributes:
         flat: (M,) robots on flat tiles.
-        leapers: (M,) robots on tiles with trenches.
+        leapers: (M,) robots on tiles of Gap, which leap over the trenches.
         landing: that of the current low policy, learned from its leaps.
         spread: (M,) m, ``landing.spread`` as it was when each robot's leaps were planned.
     """

@@ -30,7 +30,7 @@ from tdgc.tasks.rules import REACHED, episode_steps, has_failed, outcome
 from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.teacher import WAY, Skill, Teacher
-from tdgc.tasks.tiles import TrainingTiles, shallow
+from tdgc.tasks.tiles import TrainingTiles, check_families, check_levels, shallow
 
 
 class NavigationTask:
@@ -362,6 +362,8 @@ class NavigationEnv(TaskEnv):
         render_mode: str | None = None,
     ) -> None:
         self.config = config or HighLevelConfig()
+        check_families(self.config.families)
+        check_levels(self.config.levels)
         super().__init__(
             lambda seed, visual: NavigationTask(
                 self.config, low, 1, seed, visual=visual, first=seed % len(self.config.families)

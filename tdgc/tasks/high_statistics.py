@@ -12,7 +12,9 @@ def summarise(sums: Mapping[str, float]) -> dict[str, float]:
     counts = [k for k in sums if k.startswith("family/") and k.endswith("/count")]
     families = [k.removeprefix("family/").removesuffix("/count") for k in counts]
     for family in families:
-        count = max(sums[f"family/{family}/count"], 1.0)
+        count = sums[f"family/{family}/count"]
+        if not count:  # too few robots for all families
+            continue
         values[f"level/{family}"] = sums[f"family/{family}/level"] / count
         episodes = sums[f"family/{family}/episodes"]
         if episodes:

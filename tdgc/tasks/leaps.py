@@ -280,11 +280,13 @@ class LeapPlan:
         return cost + dear[:, :, None]
 
 
-def leap_command(command: Array, frequency: ArrayLike, length: ArrayLike) -> None:
-    """Turn commands (n, 15) into leaps, in place: gait, swing height, duty factor, frequency and
-    stance length."""
-    command[:, INDEX["swing_height"]] = SWING_HEIGHT
-    command[:, INDEX["duration"]] = DURATION
+def leap_command(
+    command: Array, frequency: ArrayLike, length: ArrayLike, ranges: CommandRanges
+) -> None:
+    """Turn commands (n, 15) into leaps, in place: gait, swing height and duty factor, as near to
+    those of a leap as ``ranges`` allow, and the given frequency and stance length."""
+    command[:, INDEX["swing_height"]] = np.clip(SWING_HEIGHT, *ranges.swing_height)
+    command[:, INDEX["duration"]] = np.clip(DURATION, *ranges.duration)
     command[:, INDEX["frequency"]] = frequency
     command[:, INDEX["stance_length"]] = length
     command[:, 12:] = gait_embedding(GAITS.index("pronk"))
@@ -333,8 +335,9 @@ def measure_landing(low: "Policy", config: LowLevelConfig, speed: float) -> Land
     rows, dt = np.arange(_ROBOTS), config.physics.control_dt
     stride = np.linspace(0.32, LONGEST, _ROBOTS)
     loco.command[:, INDEX["vx"]] = speed = min(speed, config.commands.vx[1])
+    frequency = np.clip(speed / stride, *config.commands.frequency)
     length = np.clip(stride, *config.commands.stance_length)
-    leap_command(loco.command, np.clip(speed / stride, *config.commands.frequency), length)
+    leap_command(loco.command, frequency, length, config.commands)
     places = np.column_stack([np.zeros(_ROBOTS), 2.0 * rows])
     loco.place(rows, places, np.zeros(_ROBOTS), np.linspace(0.0, 1.0, _ROBOTS, endpoint=False))
     landing, up, executor = Landing(), rows, Executor(loco, low)

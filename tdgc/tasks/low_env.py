@@ -34,7 +34,7 @@ from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import COLLIDED, FELL, LEFT_TILE, episode_steps, outcome
 from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
-from tdgc.tasks.tiles import FLAT, TrainingTiles, shallow
+from tdgc.tasks.tiles import FLAT, TrainingTiles, check_families, check_levels, shallow
 
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
 
@@ -399,6 +399,8 @@ class LowLevelEnv(TaskEnv):
         self, config: LowLevelConfig | None = None, render_mode: str | None = None
     ) -> None:
         self.config = config or LowLevelConfig()
+        check_families(self.config.families)
+        check_levels(self.config.levels)
         super().__init__(
             lambda seed, visual: LowLevelTask(
                 self.config, 1, seed, visual=visual, first=seed % len(self.config.families)

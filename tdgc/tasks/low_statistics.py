@@ -43,7 +43,9 @@ def summarise(sums: Mapping[str, float]) -> dict[str, float]:
             values[key] = value / sums["leapers"]
         elif kind == "level" and name.endswith("/level"):
             family = name.removesuffix("/level")
-            values[f"level/{family}"] = value / max(sums[f"level/{family}/count"], 1.0)
+            count = sums[f"level/{family}/count"]
+            if count:  # with few robots, none may be on tiles of the family
+                values[f"level/{family}"] = value / count
     for gait in GAITS:
         n = max(sums.get(f"gait/{gait}/steps", 0.0), 1.0)
         values[f"tracking/{gait}_velocity_rmse"] = (sums.get(f"gait/{gait}/lin", 0.0) / n) ** 0.5

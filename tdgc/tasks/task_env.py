@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.parallel.worker import SANE
+from tdgc.parallel.worker import are_sane
 
 
 class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -39,6 +39,8 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
         if seed is not None:
+            if seed >= 2**32:  # more than a tile's number can hold
+                seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
             self.task.close()
             self.task = self._make_task(seed, self._rendered)
         self.task.reset(np.arange(1))
@@ -50,12 +52,12 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         reward, terminated, truncated = self.task.step(np.asarray(action)[None])
         info = {"is_success": bool(self.task.reached[0])}
-        obs = self.task.observe()[0]
-        if not (np.abs([*obs, reward[0]]) <= SANE).all():  # false for NaN, too
+        seen = self.task.observe()
+        if not are_sane(seen, reward)[0]:
             self.task.restart()
             return self._seen, 0.0, False, True, info
-        self._seen = obs
-        return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+        self._seen = seen[0]
+        return self._seen, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     @property
     def _rendered(self) -> bool:

@@ -242,7 +242,7 @@ class Teacher:
             commanded = np.full(len(rows), self._leap_speed)
             motion = Motion.of(loco, rows, local[rows, 0], self.speed[rows], commanded)
             lesson = self._plan.lesson(rows, motion, self._landing)
-            leap_command(leaps, lesson.frequency, lesson.length)
+            leap_command(leaps, lesson.frequency, lesson.length, self._ranges)
             command[rows], self.price[rows] = leaps, lesson.price
             self.other[rows], self.dearer[rows] = leaps, 0.0
         return command

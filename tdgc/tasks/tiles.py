@@ -57,6 +57,11 @@ def check_levels(levels: int) -> None:
         raise ValueError(f"'env.levels' must be from 1 to {MAX_LEVEL + 1}, not {levels}")
 
 
+def left_out(families: Sequence[str], robots: int) -> list[str]:
+    """Families that no robot is on if ``robots`` of them are dealt to ``families`` in turn."""
+    return [family for family in dict.fromkeys(families) if family not in families[:robots]]
+
+
 def shallow(tile: Tile, level: int, shallowest: float) -> Tile:
     """The tile with shallower trenches and pits: their greatest depth grows with the square of the
     level, from ``shallowest`` m on level 0 to the full 60 cm on level 10.
