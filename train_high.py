@@ -27,6 +27,7 @@ from tdgc.config import (
     ConfigError,
     HighLevelConfig,
     HighTrainConfig,
+    differences,
     to_dict,
     with_overrides,
 )
@@ -52,7 +53,7 @@ from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.manners import check_manner, find_manner, manner_of, may_leap, nearest
+from tdgc.tasks.manners import find_manner, manner_of, may_leap, within
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.teacher import Skill
@@ -107,25 +108,29 @@ def pin_low(config: HighTrainConfig, path: str) -> HighTrainConfig:
 
 
 def with_manner(config: HighTrainConfig, low: Policy, init: Path | None) -> HighTrainConfig:
-    """Add how the teacher commands the low policy, unless it is set or there is no teacher.
+    """Add how the teacher commands the low policy, if there is a teacher, and print where the
+    command ranges limit it.
 
-    It is found by trials; a policy ``init`` that training begins from hands on that of its own
-    teacher.
+    Unless it is set, it is found by trials; a policy ``init`` that training begins from hands on
+    that of its own teacher.
 
     Raises:
         PolicyFileError, ConfigError: ``init`` cannot be read.
     """
-    imitation = config.imitation
-    if imitation.teacher is not None:
-        return config
-    if init is not None:
-        assert config.env.commands is not None  # ``paired`` has set them
-        manner = nearest(manner_of(policies.load(init), init), config.env.commands)
-    elif imitation.steps:
+    manner = config.imitation.teacher
+    if manner is None and init is not None:
+        manner = manner_of(policies.load(init), init)
+    elif manner is None and config.imitation.steps:
         manner = find_manner(low, config.env, tqdm.write)
-    else:
+    if manner is None:
         return config
-    return dataclasses.replace(config, imitation=dataclasses.replace(imitation, teacher=manner))
+    ranges = paired(config.env, load_low(low)[1]).commands
+    assert ranges is not None  # ``paired`` has set them
+    limited = within(manner, ranges)
+    for change in differences(to_dict(limited), to_dict(manner), "imitation.teacher"):
+        tqdm.write(f"the command ranges limit the teacher: {change}")
+    imitation = dataclasses.replace(config.imitation, teacher=limited)
+    return dataclasses.replace(config, imitation=imitation)
 
 
 def start_action(config: HighTrainConfig) -> Array:
@@ -314,8 +319,6 @@ def check(config: HighTrainConfig, control_dt: float) -> None:
                 "'env.first_level' and 'env.first_levels' have no effect with env.curriculum "
                 f"{env.curriculum}"
             )
-    if config.imitation.teacher is not None and env.commands is not None:
-        check_manner(config.imitation.teacher, env.commands)
     parts = {"ppo": ppo.minibatches}
     if config.imitation.steps:
         parts["imitation"] = config.imitation.minibatches

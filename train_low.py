@@ -127,7 +127,8 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
     if done is not None and (done["robots"] or not robots):
         if done["robots"] and not robots:
             raise ConfigError(
-                f"{out / 'policy'} is already calibrated; without, it is {out / 'uncalibrated'}"
+                f"'calibration.robots' is 0, but {out / 'policy'} is already calibrated; the "
+                f"policy from before is {out / 'uncalibrated'}"
             )
         for name in ("robots", "turns") if robots else ():
             asked = getattr(config.calibration, name)

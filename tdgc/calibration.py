@@ -55,7 +55,7 @@ Correction = Callable[[Array], Array]
 
 #: Fewer robots whose walking is measured say nothing about the commands.
 LEAST_ROBOTS = 64
-_LEAST_WALKED = 8  # of them: one is held out to measure the networks' error
+_LEAST_WALKED = 8  # of them: four are held out to measure the networks' error
 _STREAM = 3  # of random numbers; training and evaluation have others (``tdgc.sim.terrain``)
 _BATCH = 400  # robots that walk at the same time
 _WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2  # the mean is over the rest
@@ -161,7 +161,8 @@ class ResponseModel:
 
     @policies.one_thread()
     def _fit(self, given: Array, reached: Array, rng: np.random.Generator) -> Array:
-        # Robots are dealt to the gaits in turn, so a whole round of gaits is held out.
+        # Robots are dealt to the gaits in turn, so of eight rounds of gaits one is held out. (Those
+        # that fell are missing from the rounds.)
         held = np.arange(len(given)) // len(GAITS) % 8 == 0
         # A mirrored robot responds to the mirrored command with the mirrored velocity.
         sign = np.array([np.ones(NUM_COMMANDS), _SIGN])[:, None]
@@ -424,8 +425,8 @@ def main(arguments: list[str] | None = None) -> int:
         low = load_low(args.low)[0]
         if low.meta.get("calibration", {}).get("robots"):
             raise ValueError(
-                f"{args.low} is calibrated already; train_low.py keeps the policy "
-                "from before as 'uncalibrated' beside it"
+                f"{args.low} is calibrated already; give the policy from before, which "
+                "train_low.py keeps as 'uncalibrated' in its run folder"
             )
         make_folder(args.out.parent)
     except (ValueError, OSError) as error:

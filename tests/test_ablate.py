@@ -374,6 +374,7 @@ def test_a_table_that_cannot_be_written_is_one_line(
         ("--low nowhere/low", "nowhere/low.json: no such file"),
         ("--seeds 3,-1", "'seed' must be"),
         ("--steps 0", "'steps' must be"),
+        ("--time-limit nan", "--time-limit must be at least 0 s, not nan"),
         ("--set seed=7", "--set cannot change 'seed' here; use --seeds"),
         ("--set low=runs/low/policy", "--set cannot change 'low' here; use --low"),
     ],

@@ -303,7 +303,7 @@ def test_script(
         ),
         (["--low", "{0}/low", "--turns", "0"], "--turns must be 1 or more, not 0"),
         (["--low", "tdgc/pretrained/high"], "high: not a low policy of this package"),
-        (["--low", "tdgc/pretrained/low"], "low is calibrated already; train_low.py keeps"),
+        (["--low", "tdgc/pretrained/low"], "low is calibrated already; give the policy"),
         (["--low", "{0}/low", "--workers", "0"], "--workers must be 1 or more, not 0"),
     ],
 )

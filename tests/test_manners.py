@@ -4,11 +4,11 @@ import dataclasses
 
 import pytest
 
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, TeacherConfig
+from tdgc.config import HighLevelConfig, TeacherConfig
 from tdgc.policies import Policy
 from tdgc.tasks import manners
 from tdgc.tasks.leaps import SPEED
-from tdgc.tasks.manners import arrivals, check_manner, choose, find_manner
+from tdgc.tasks.manners import arrivals, choose, find_manner
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 
 FAST = TeacherConfig(walk_speed=0.9, step_frequency=3.3)
@@ -54,8 +54,7 @@ def test_walks_are_tried_first_and_leaps_only_where_there_may_be_trenches(
 
     monkeypatch.setattr(manners, "arrivals", arrives)
     low, told = load_low(PRETRAINED / "low")[0], []
-    ranges = CommandRanges()
-    flat = HighLevelConfig(families=("tilt",), commands=ranges)
+    flat = HighLevelConfig(families=("tilt",))
     for env in (flat, dataclasses.replace(flat, families=("gap",), gaits=("trot", "pace"))):
         asked.clear()
         assert find_manner(low, env, told.append) == FAST
@@ -66,19 +65,6 @@ def test_walks_are_tried_first_and_leaps_only_where_there_may_be_trenches(
     assert all(manner.walk_speed == 0.9 for family, manner in asked if family == "gap")
     assert told[2] == "trial: 48 of 48 robots climb stairs at 0.9 m/s with 3.3 Hz"
     assert told[-1] == "trial: 48 of 48 robots leap over trenches at 1 m/s"
-
-
-def test_a_manner_is_what_the_teacher_can_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(manners, "arrivals", lambda *given: 48)
-    slow = dataclasses.replace(CommandRanges(), vx=(-0.5, 0.5), frequency=(2.5, 4.0))
-    env = HighLevelConfig(families=("tilt",), commands=slow)
-    low = load_low(PRETRAINED / "low")[0]
-    assert find_manner(low, env, lambda line: None) == TeacherConfig(0.5, 2.5, 0.5)
-    with pytest.raises(
-        ConfigError, match=r"'imitation.teacher.walk_speed' must be from -0.5 to 0.5"
-    ):
-        check_manner(TeacherConfig(), slow)
-    check_manner(TeacherConfig(), CommandRanges())
 
 
 def test_the_shipped_low_policy_arrives_and_one_that_falls_does_not() -> None:

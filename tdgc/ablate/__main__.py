@@ -224,6 +224,8 @@ def main(arguments: list[str] | None = None) -> int:
         args.episodes, args.workers, deadline,
     )  # fmt: skip
     try:
+        if args.time_limit is not None and not args.time_limit >= 0.0:
+            raise InputError(f"--time-limit must be at least 0 s, not {args.time_limit:g}")
         chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
         check_trainings(runner, chosen, seeds)
         if args.only is None:

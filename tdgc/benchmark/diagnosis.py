@@ -287,7 +287,7 @@ def _evidence(
     words = [
         f"{name} off by {error:.2f} {LIMITS[name].unit} (limit {limits[name]:g})"
         for name, error in errors.items()
-    ] or ["tracking not judged: too short, at a pillar or at the edge"]
+    ] or ["tracking not judged: too short, at an obstacle or at the edge"]
     words.append(f"asked for {towards:+.2f} m/s towards the goal")
     for name in TRACKED:
         share = np.sum(trace[f"at_bound_{name}"][:-1][intervals] != 0.0) / max(intervals.sum(), 1)

@@ -35,7 +35,7 @@ from tdgc.state import State
 #: the limit is 50 m/s, 400 rad/s or 10 m above the ground.
 SANE_OBSERVATION = 100.0
 #: Likewise for rewards, which are of order one at the default weights; with the largest weights
-#: (``tdgc.config.settings.Weight``) they come to a few ten thousand.
+#: (``tdgc.config.settings.Weight``) all but those for contact forces come to a few ten thousand.
 SANE_REWARD = 1e5
 
 

@@ -4,6 +4,7 @@
 Arrays have a leading axis of M robots. Legs are in the order of ``tdgc.sim.gaits.FEET``.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,6 +64,11 @@ def _between_thighs(geometry: Geometry) -> Array:
     return np.array([length, width + 2.0 * geometry.abduction])
 
 
+def _rounded(value: float, places: int) -> float:
+    """A positive value rounded to ``places`` after the point, but to no less than two digits."""
+    return round(value, max(places, 1 - math.floor(math.log10(value))))
+
+
 def fitted(config: RobotConfig) -> dict[str, Any]:
     """Settings for the robot whose URDF ``config`` names, by field: motor limits from the URDF, and
     the shipped robot's settings scaled to its size and mass.
@@ -80,8 +86,8 @@ def fitted(config: RobotConfig) -> dict[str, Any]:
     found: dict[str, Any] = {
         "base_height": round(height * ours.base_height, 2),
         "stance": tuple(stance.round(2).tolist()),
-        "kp": float(f"{mass * length * ours.kp:.3g}"),
-        "kd": float(f"{mass * length**1.5 * ours.kd:.2g}"),
+        "kp": _rounded(mass * length * ours.kp, 1),
+        "kd": _rounded(mass * length**1.5 * ours.kd, 2),
     }
     for name, limits in zip(("torque_limit", "speed_limit"), own.motor_limits, strict=True):
         known = np.isfinite(limits)

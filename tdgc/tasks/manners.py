@@ -10,14 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from tdgc.config import (
-    FIRST_TEACHER,
-    CommandRanges,
-    ConfigError,
-    HighLevelConfig,
-    TeacherConfig,
-    recorded,
-)
+from tdgc.config import FIRST_TEACHER, CommandRanges, HighLevelConfig, TeacherConfig, recorded
 from tdgc.policies import Policy
 from tdgc.sim.commands import NUM_ACTIONS
 from tdgc.sim.terrain import MAX_LEVEL, may_have_trenches
@@ -43,33 +36,12 @@ def may_leap(env: HighLevelConfig) -> bool:
     return "pronk" in env.gaits and any(map(may_have_trenches, env.families))
 
 
-def bounds(ranges: CommandRanges) -> dict[str, tuple[float, float]]:
-    """Ranges of the settings of ``TeacherConfig``, by name."""
-    return {"walk_speed": ranges.vx, "step_frequency": ranges.frequency, "leap_speed": ranges.vx}
-
-
-def nearest(manner: TeacherConfig, ranges: CommandRanges) -> TeacherConfig:
-    """The manner within ``ranges`` that is nearest to ``manner``."""
+def within(manner: TeacherConfig, ranges: CommandRanges) -> TeacherConfig:
+    """The manner as a teacher with these command ranges carries it out."""
+    allowed = {"walk_speed": ranges.vx, "step_frequency": ranges.frequency, "leap_speed": ranges.vx}
     return TeacherConfig(
-        **{
-            name: float(np.clip(getattr(manner, name), *allowed))
-            for name, allowed in bounds(ranges).items()
-        }
+        **{name: float(np.clip(getattr(manner, name), *ends)) for name, ends in allowed.items()}
     )
-
-
-def check_manner(manner: TeacherConfig, ranges: CommandRanges) -> None:
-    """Check that a teacher can command what its manner says.
-
-    Raises:
-        ConfigError: a setting is outside the command ranges.
-    """
-    for name, (low, high) in bounds(ranges).items():
-        value = getattr(manner, name)
-        if not low <= value <= high:
-            raise ConfigError(
-                f"'imitation.teacher.{name}' must be from {low:g} to {high:g}, not {value:g}"
-            )
 
 
 def find_manner(low: Policy, env: HighLevelConfig, tell: Callable[[str], None]) -> TeacherConfig:
@@ -79,7 +51,7 @@ def find_manner(low: Policy, env: HighLevelConfig, tell: Callable[[str], None]) 
 
     Args:
         low: the low policy.
-        env: the MDP in which the teacher decides, with its command ranges.
+        env: the MDP in which the teacher decides.
         tell: is given the result of each trial, a line of text.
     """
 
@@ -94,17 +66,15 @@ def find_manner(low: Policy, env: HighLevelConfig, tell: Callable[[str], None]) 
         tell(f"trial: {arrived} of {ROBOTS} robots leap over trenches at {manner.leap_speed:g} m/s")
         return arrived
 
-    ranges = env.commands
-    assert ranges is not None  # ``paired`` has set them
-    usual = nearest(TeacherConfig(), ranges)
+    usual = TeacherConfig()
     others = [
         dataclasses.replace(usual, walk_speed=speed, step_frequency=frequency)
         for speed, frequency in WALKS
     ]
-    best = choose(climb, [usual, *(nearest(manner, ranges) for manner in others)])
+    best = choose(climb, [usual, *others])
     if may_leap(env):
         others = [dataclasses.replace(best, leap_speed=speed) for speed in LEAPS]
-        best = choose(leap, [best, *(nearest(manner, ranges) for manner in others)])
+        best = choose(leap, [best, *others])
     return best
 
 

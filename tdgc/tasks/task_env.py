@@ -39,7 +39,7 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
         if seed is not None:
-            if seed >= 2**32:  # more than a tile's number can hold
+            if seed >= 2**32:  # more than a tile can be drawn from
                 seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
             self.task.close()
             self.task = self._make_task(seed, self._rendered)
