@@ -57,6 +57,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EDITION
 from tdgc.sim.world import World
+from tdgc.tasks import manners
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.rules import OUTCOMES
@@ -476,6 +477,21 @@ def test_the_scripts_command_as_the_teacher_of_the_high_policy_did(low, tmp_path
     high.with_suffix(".json").write_text(json.dumps(header), encoding="utf-8")
     assert evaluate.main(flags) == 2
     assert "high, meta.teacher: the key 'leap_speed' is missing" in capsys.readouterr().err
+
+
+def test_without_a_high_policy_the_scripts_try_out_what_suits_the_low_policy(
+    low, monkeypatch, capsys
+):
+    def arrives(low: Any, env: Any, manner: TeacherConfig, family: str) -> int:
+        return 48 * (manner.walk_speed == 0.9 if family == "stair" else manner.leap_speed == 1.0)
+
+    monkeypatch.setattr(manners, "arrivals", arrives)
+    asked = evaluate.Evaluation.of(evaluate.parse(["--policies", "teacher"]))
+    skill = dataclasses.replace(asked, high=None).skill(low, load_low(low)[1])
+    assert skill.manner == TeacherConfig(0.9, 3.3, 1.0)
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "there is no high policy: trying out how the low policy walks and leaps best"
+    assert said[-1] == "trial: 48 of 48 robots leap over trenches at 1 m/s"
 
 
 def test_the_window_shows_the_tuned_policy(monkeypatch):
