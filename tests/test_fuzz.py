@@ -259,7 +259,7 @@ def test_any_configuration_of_a_run(folder: Path, content: bytes | Damage) -> No
     good = json.dumps(to_dict(LowTrainConfig())).encode()
     data = content if isinstance(content, bytes) else damaged(good, content)
     (run / "config.json").write_bytes(data)
-    flags = dict.fromkeys(("seed", "n_envs", "workers", "steps", "cluster", "init"))
+    flags = dict.fromkeys(("seed", "n_envs", "workers", "steps", "cluster", "init", "time_limit"))
     flags |= {"out": run, "resume": True, "assignments": [], "device": "cpu", "worker_timeout": 1.0}
     args = Namespace(**flags)
     found = answer(lambda: configure(LowTrainConfig(), args), ConfigError)

@@ -728,10 +728,12 @@ def test_disturbances_widen_with_the_level():
 
 
 def test_success_is_the_share_of_episodes_that_reached_the_goal():
-    task = NavigationTask(CONFIG, LOW, 1, seed=3, training=False)
+    config = dataclasses.replace(CONFIG, families=("stair", "tilt"))
+    task = NavigationTask(config, LOW, 1, seed=3, training=False)
     task.reset(np.arange(1))
     task.step(np.zeros((1, 13)))
     stats = task.take_stats()
     task.close()
-    stats |= {"family/stair/episodes": 4.0, "family/stair/reached": 1.0}
-    assert summarise(stats)["success/stair"] == 0.25
+    values = summarise(stats | {"family/stair/episodes": 4.0, "family/stair/reached": 1.0})
+    assert values["success/stair"] == 0.25
+    assert "level/stair" in values and "level/tilt" not in values  # no robot is on tilt
