@@ -10,11 +10,11 @@ import pytest
 import torch as th
 
 from tdgc import calibration, policies
-from tdgc.benchmark.tracking import walk_on_plane
+from tdgc.benchmark.tracking import draw_commands, walk_on_plane
 from tdgc.calibration import Corrector, ResponseModel, distil, measure, shown, training_tasks
 from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
 from tdgc.policies import AsymmetricActorCriticPolicy, Policy
-from tdgc.sim.commands import INDEX
+from tdgc.sim.commands import INDEX, gait_index
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import width
@@ -245,6 +245,29 @@ def test_a_student_learns_what_is_done_at_corrected_commands(
             task.close()
     assert last < 0.5 * first
     assert any(not th.equal(t, low.tensors[name]) for name, t in student.tensors().items())
+
+
+def test_a_student_also_learns_commands_that_its_robots_do_not_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Six robots keep their commands for the 0.8 s of these lessons."""
+    monkeypatch.setattr(calibration, "_TURN", 8)
+    standing = dataclasses.replace(CONFIG.robot, commanded_gait=False)
+    config = dataclasses.replace(CONFIG, robot=standing)
+    low = save_low(tmp_path / "low", config)
+    task = LowLevelTask(dataclasses.replace(config, terrain="plane"), 6, seed=0)
+    student, _, _ = distil(low, faster, [task], turns=5, seed=0)
+    errors = np.zeros(2)
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        gait = gait_index(task.locomotion.command)
+        task.locomotion.command = draw_commands(rng, config.commands, gait)
+        x, wanted = shown(low, faster, task)
+        with th.inference_mode():
+            for k, actor in enumerate((low.actor, student)):
+                errors[k] += np.square(actor(th.from_numpy(x)).numpy() - wanted).sum()
+    task.close()
+    assert errors[1] < 0.05 * errors[0]
 
 
 def test_a_robot_that_blows_up_does_not_end_the_lessons(
