@@ -130,18 +130,16 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
                 f"'calibration.robots' is 0, but {out / 'policy'} is already calibrated; the "
                 f"policy from before is {out / 'uncalibrated'}"
             )
-        for name in ("robots", "turns") if robots else ():
-            asked = getattr(config.calibration, name)
-            if done[name] != asked:
-                raise ConfigError(
-                    f"{out / 'policy'} is already calibrated, with 'calibration.{name}' "
-                    f"{done[name]}, not {asked}; python -m tdgc.calibration --low "
-                    f"{out / 'uncalibrated'} does it again"
-                )
+        if done["robots"] != robots:
+            raise ConfigError(
+                f"{out / 'policy'} is already calibrated, with 'calibration.robots' "
+                f"{done['robots']}, not {robots}; python -m tdgc.calibration --low "
+                f"{out / 'uncalibrated'} does it again"
+            )
         return
     if not robots:
         meta = {**learned.meta, "calibration": {"robots": 0}}
-        policies.save_copy(out / "policy", learned, {}, meta)
+        policies.save_copy(out / "policy", learned, meta)
         return
     with tqdm(desc="calibrating", total=100, bar_format="{desc}: {percentage:3.0f}%|{bar}|") as bar:
 
@@ -152,15 +150,13 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
 
         try:
             workers = min(config.workers, usable_cores())  # here, also after a run on a cluster
-            student, facts = calibrate(
-                learned, config.calibration, workers, config.seed, tick, config.plane_share
-            )
+            correction, facts = calibrate(learned, config.calibration, workers, config.seed, tick)
         except StoppedError:
             interruption.tell(out)
             return
-    policies.save_copy(out / "uncalibrated", learned, {}, learned.meta)
+    policies.save_copy(out / "uncalibrated", learned, learned.meta)
     meta = {**learned.meta, "calibration": facts}
-    policies.save_copy(out / "policy", learned, student.tensors(), meta)
+    policies.save_copy(out / "policy", learned, meta, correction)
 
 
 def build(

@@ -465,6 +465,7 @@ def _stage(pair: Pair, controller: Controller) -> tuple[Locomotion, Array, Array
     physics = dataclasses.replace(config.physics, control_dt=controller.dt)
     world = World(1, controller.robot(), physics, field)
     loco = Locomotion(1, config.robot, config.physics, field, config.gyro, world=world)
+    loco.correct = pair.low.correct
     return loco, field.starts[:, 0], field.goals[:, 0]
 
 

@@ -240,7 +240,7 @@ def test_the_teacher_leads_as_it_taught_the_full_hierarchy(
         finish(tmp_path / "full-7")
         low = policies.load(LOW)
         meta = low.meta | ({"teacher": {}} if taught else {})
-        policies.save_copy(tmp_path / "full-7" / "policy", low, {}, meta)
+        policies.save_copy(tmp_path / "full-7" / "policy", low, meta)
     monkeypatch.setattr(trials, "call", evaluated)
     runner = Runner(tmp_path, LOW, False, ('env.families=["tilt"]',), None, "6", 1, 1, None)
     assert runner.run(Trial(named("teacher"), None)).reached.tolist() == [True]

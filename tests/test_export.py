@@ -25,8 +25,8 @@ from tdgc.deploy.interface import ExportError
 from tdgc.export import TOLERANCE
 from tdgc.files import checksum
 from tdgc.learn.recurrent import FastRecurrentPolicy
-from tdgc.policies import AsymmetricActorCriticPolicy, Policy
-from tdgc.sim.commands import CommandDecoder, default_command
+from tdgc.policies import AsymmetricActorCriticPolicy, Correction, Policy
+from tdgc.sim.commands import NAMES, SIDEWAYS, CommandDecoder, default_command
 from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import observe, width
@@ -588,7 +588,7 @@ def test_the_robots_meshes_come_along(tmp_path: Path) -> None:
     (package / "meshes" / "hip.obj").write_text(bare + "# another\n")
     names = ["hip.obj", "../meshes/hip.obj", "package://dog/meshes/hip.obj", "hip.obj"]
     config = with_meshes(package / "urdf" / "dog.urdf", names)
-    policies.save_copy(tmp_path / "low", LOW_POLICY, {}, {"config": to_dict(config)})
+    policies.save_copy(tmp_path / "low", LOW_POLICY, {"config": to_dict(config)})
     short = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
     high = random_high(tmp_path / "high", short, config)
     export.write(export.load_pair(tmp_path / "low", high), out, ["torchscript"])
@@ -625,6 +625,28 @@ def test_a_robot_needs_no_part_of_this_package(folder: Path) -> None:
     wanted = run(graph, {s.name: np.full(s.size, 0.3) for s in graph.inputs})["joint_targets"]
     for targets in json.loads(result.stdout):
         assert targets == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_correction_is_part_of_the_graph(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    tensors = {
+        "zero": th.zeros(15), "unit": th.ones(15),
+        "sign": th.tensor([-1.0 if name in SIDEWAYS else 1.0 for name in NAMES]),
+        "0.weight": th.from_numpy(rng.normal(0.0, 1.0, (8, 15))).float(), "0.bias": th.ones(8),
+        "1.weight": th.from_numpy(rng.normal(0.0, 0.3, (3, 8))).float(), "1.bias": th.zeros(3),
+    }  # fmt: skip
+    low = tmp_path / "low"
+    policies.save_copy(low, LOW_POLICY, LOW_POLICY.meta, Correction((15, 8, 3), tensors))
+    short = dataclasses.replace(HIGH_CONFIG, episode_seconds=1.0)
+    high, kinds = random_high(tmp_path / "high", short), ["onnx", "torchscript"]
+    (tmp_path / "out").mkdir()
+    export.write(export.load_pair(low, high), tmp_path / "out", kinds)
+    for kind in kinds:
+        assert export.check(tmp_path / "out", kind, low, high).difference <= TOLERANCE
+    plain, corrected = (LowGraph(policy, LOW_CONFIG) for policy in (LOW_POLICY, load_low(low)[0]))
+    values = {s.name: np.full(s.size, 0.3) for s in plain.inputs}
+    targets = [run(graph, values)["joint_targets"] for graph in (plain, corrected)]
+    assert np.abs(targets[0] - targets[1]).max() > 0.02
 
 
 # --- the command --------------------------------------------------------------------------------
@@ -667,7 +689,7 @@ def test_a_robot_that_cannot_be_loaded_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], mesh: str, message: str
 ) -> None:
     config = with_meshes(tmp_path / "robot.urdf", [mesh])
-    policies.save_copy(tmp_path / "low", LOW_POLICY, {}, {"config": to_dict(config)})
+    policies.save_copy(tmp_path / "low", LOW_POLICY, {"config": to_dict(config)})
     high = random_high(tmp_path / "high", HIGH_CONFIG, config, hidden=4)
     flags = ["--low", str(tmp_path / "low"), "--high", str(high), "--format", "torchscript"]
     assert export.main([*flags, "--out", str(tmp_path / "out")]) == 2

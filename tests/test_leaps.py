@@ -214,6 +214,9 @@ def test_landing_of_the_shipped_low_policy() -> None:
 class Flail:
     """A low policy that commands the same random joint targets at every step."""
 
+    def correct(self, commands: np.ndarray) -> np.ndarray:
+        return commands
+
     def predict(self, observation: np.ndarray) -> tuple[np.ndarray, None]:
         rng = np.random.default_rng(0)
         return rng.uniform(-4.0, 4.0, (len(observation), 12)), None

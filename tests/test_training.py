@@ -527,7 +527,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     config = (broken / "config.json").read_text(encoding="utf-8")
     other = tmp_path / "other"
     low = policies.load(PRETRAINED / "low")
-    policies.save_copy(other, low, low.actor.tensors(), {**low.meta, "note": "trained on"})
+    policies.save_copy(other, low, {**low.meta, "note": "trained on"})
     assert train_high.main(["--resume", "--out", str(broken), "--low", str(other)]) == 2
     error = capsys.readouterr().err
     assert f"train_high.py: {other} is not the low policy that this run began with" in error
@@ -562,7 +562,7 @@ def test_the_manner_of_the_teacher(
     assert manner(alone, PRETRAINED / "high") == TeacherConfig(**FIRST_TEACHER)
     high = policies.load(PRETRAINED / "high")
     taught = {**high.meta, "teacher": to_dict(TeacherConfig(leap_speed=1.0))}
-    policies.save_copy(tmp_path / "high", high, high.actor.tensors(), taught)
+    policies.save_copy(tmp_path / "high", high, taught)
     assert manner(alone, tmp_path / "high") == TeacherConfig(leap_speed=1.0)
     assert capsys.readouterr().out == ""
     # What the teacher cannot command is not recorded, and said.
@@ -624,12 +624,10 @@ def test_calibration_ends_a_run_of_the_low_policy(
     """
     monkeypatch.setattr(calibration, "_EPOCHS", 2)
     monkeypatch.setattr(calibration, "_CORRECTIONS", 4)
-    monkeypatch.setattr(calibration, "_ROBOTS", 12)
     monkeypatch.setattr(calibration, "_WALK_SECONDS", 0.3)
     monkeypatch.setattr(calibration, "_SETTLE_SECONDS", 0.1)
     monkeypatch.setattr(calibration, "run_jobs", in_this_process)
     arguments = [*TINY, "--steps", "32", "--set", "calibration.robots=64"]
-    arguments += ["--set", "calibration.turns=1"]
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert train_low.main([*arguments, "--out", str(whole)]) == 0
     learned, given = policies.load(whole / "uncalibrated"), policies.load(whole / "policy")
@@ -640,7 +638,7 @@ def test_calibration_ends_a_run_of_the_low_policy(
     second: list[int] = []
 
     def stop(call: int, interruption: Interruption) -> None:
-        if call == 4:
+        if call == 3:
             second.append(train_low.main(["--resume", "--out", str(broken)]))
             interruption.reason = "the test"
 
@@ -662,13 +660,13 @@ def test_calibration_ends_a_run_of_the_low_policy(
     later = tmp_path / "later"
     assert train_low.main([*TINY, "--steps", "32", "--out", str(later)]) == 0
     assert policies.load(later / "policy").meta["calibration"] == {"robots": 0}
-    resumed = ["--resume", "--set", "calibration.robots=64", "--set", "calibration.turns=1"]
+    resumed = ["--resume", "--set", "calibration.robots=64"]
     assert train_low.main([*resumed, "--out", str(later)]) == 0
     assert weights(later) == weights(whole)
     assert "calibration" not in policies.load(later / "uncalibrated").meta
-    again = [*resumed, "--set", "calibration.turns=2", "--out", str(later)]
+    again = ["--resume", "--set", "calibration.robots=65", "--out", str(later)]
     assert train_low.main(again) == 2
-    said = "policy is already calibrated, with 'calibration.turns' 1, not 2; python -m"
+    said = "policy is already calibrated, with 'calibration.robots' 64, not 65; python -m"
     assert said in "".join(capfd.readouterr())
     without = ["--resume", "--set", "calibration.robots=0", "--out", str(later)]
     assert train_low.main(without) == 2
@@ -946,11 +944,11 @@ def test_the_low_policy_is_what_the_first_command_left(
     monkeypatch.chdir(tmp_path)
     assert train_high.find_low() == shipped
     left = {key: value for key, value in low.meta.items() if key != "calibration"}
-    policies.save_copy(tmp_path / "runs" / "low" / "policy", low, {}, left)
+    policies.save_copy(tmp_path / "runs" / "low" / "policy", low, left)
     assert train_high.find_low() == shipped
     assert "runs/low/policy comes from an unfinished run" in "".join(capsys.readouterr())
     policies.save_copy(
-        tmp_path / "runs" / "low" / "policy", low, {}, {**left, "calibration": {"robots": 64}}
+        tmp_path / "runs" / "low" / "policy", low, {**left, "calibration": {"robots": 64}}
     )
     assert train_high.find_low() == "runs/low/policy"
 
@@ -960,7 +958,7 @@ def test_one_range_may_be_narrowed_and_the_others_stay_the_low_policys(tmp_path:
     low = policies.load(PRETRAINED / "low")
     wide = dataclasses.replace(CommandRanges(), vy=(-0.4, 0.4), pitch=(-0.2, 0.1))
     config = dataclasses.replace(load_low(low)[1], commands=wide)
-    policies.save_copy(tmp_path / "low", low, {}, {**low.meta, "config": to_dict(config)})
+    policies.save_copy(tmp_path / "low", low, {**low.meta, "config": to_dict(config)})
     small = ["--steps", "96", "--n-envs", "4", "--workers", "1", "--time-limit", "0"]
     flags = ["--no-teacher", "--low", str(tmp_path / "low"), "--set", "env.commands.vx=[-0.5,0.5]"]
     assert train_high.main([*small, *flags, "--out", str(tmp_path / "run")]) == 0

@@ -273,7 +273,7 @@ def changed_pair(
 def _copy(source: Path, target: Path, changes: dict[str, Any]) -> Path:
     """Write a copy of a policy with changes to its ``meta``."""
     policy = policies.load(source)
-    policies.save_copy(target, policy, {}, _changed(policy.meta, changes))
+    policies.save_copy(target, policy, _changed(policy.meta, changes))
     return target
 
 

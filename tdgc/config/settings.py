@@ -126,10 +126,11 @@ def recorded(cls: type[Config], data: Mapping[str, Any], source: object) -> Conf
 
 
 def _with_before(cls: Any, data: Any) -> Any:
-    """``data``, completed with the ``before`` values of those settings of ``cls`` that it lacks."""
+    """``data`` with the ``before`` values of settings of ``cls`` that it lacks, and without those
+    that ``cls`` has ``RETIRED``."""
     if not isinstance(data, Mapping):
         return data
-    filled = dict(data)
+    filled = {key: data[key] for key in data if key not in getattr(cls, "RETIRED", ())}
     hints = typing.get_type_hints(cls)
     for f in dataclasses.fields(cls):
         if f.name in data and dataclasses.is_dataclass(hints[f.name]):

@@ -1,7 +1,7 @@
 """Settings of a run of train_low.py or train_high.py."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 from tdgc.config.high import HighLevelConfig
 from tdgc.config.low import LowLevelConfig
@@ -39,8 +39,10 @@ class PPOConfig:
 class CalibrationConfig:
     """Calibration of the low policy (``tdgc.calibration``), the last phase of train_low.py."""
 
+    #: Settings of earlier calibrations, which runs may have recorded.
+    RETIRED: ClassVar[tuple[str, ...]] = ("turns",)
+
     robots: Whole = 4800  # whose walking is measured; 0: none
-    turns: Count = 60  # rounds of distillation, of 60 control steps each
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class LowTrainConfig:
     env: LowLevelConfig = field(default_factory=LowLevelConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     calibration: CalibrationConfig = field(
-        default_factory=CalibrationConfig, metadata={"before": {"robots": 0, "turns": 60}}
+        default_factory=CalibrationConfig, metadata={"before": {"robots": 0}}
     )
 
 

@@ -254,6 +254,7 @@ class LowGraph(nn.Module):
     def __init__(self, policy: Policy, config: LowLevelConfig) -> None:
         super().__init__()
         self.actor = ClippedActor(policy)
+        self.correct = policy.correction
         robot = config.robot
         self.dt = _constant(config.physics.control_dt)
         self.pose = Pose(robot, config.physics.control_dt)
@@ -316,6 +317,8 @@ class LowGraph(nn.Module):
             early = 1.0 - (cycles / self.start).clamp(max=1.0)
             missing = (self.least - command[INDEX["frequency"]]).clamp(min=0.0)
             command = command + self.is_frequency * (early * missing)
+        if self.correct is not None:
+            command = self.correct(command[None])[0]
         named = by_command(command)
         phases = foot_phases(clock + self.pose.ahead * named["frequency"], named)
         pose = self.pose(phases, grown, named)

@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from tdgc.policies.acting import Actor, Policy, State, load, one_thread, save_copy
+from tdgc.policies.correction import Correction
 from tdgc.policies.files import ACTIVATIONS, Header, Mirror, PolicyFileError
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ __all__ = [
     "ACTIVATIONS",
     "Actor",
     "AsymmetricActorCriticPolicy",
+    "Correction",
     "Header",
     "Mirror",
     "Policy",

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import nn
 
+from tdgc.policies.correction import Correction
 from tdgc.policies.files import LSTM_TENSORS, Header, read, store
 
 Array = NDArray[np.float32]
@@ -20,6 +21,21 @@ State = tuple[NDArray[np.float32], ...]
 _FUNCTIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
     "elu": F.elu, "relu": th.relu, "tanh": th.tanh
 }  # fmt: skip
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Run PyTorch on one thread, as a context manager or a decorator.
+
+    The networks are too small to parallelise: one thread costs nothing when cores are idle, is
+    several times faster when they are busy, and gives the same bits whatever the thread setting.
+    """
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(threads)
 
 
 class Actor(nn.Module):
@@ -62,10 +78,6 @@ class Actor(nn.Module):
             x = 0.5 * (seen + mirrored.index_select(1, action_index) * action_sign)
         return x
 
-    def tensors(self) -> dict[str, th.Tensor]:
-        """The weights by their names in a policy's file."""
-        return {f"actor.{name[7:]}": tensor for name, tensor in self.state_dict().items()}
-
 
 class Policy:
     """A loaded policy that acts as SB3's does, without SB3.
@@ -80,6 +92,7 @@ class Policy:
         low, high: bounds of the actions, (action_dim,), in the environment's action units.
         tensors: all weights by name in the file, including the critic's.
         actor: the actor's MLP, without LSTM and encoder.
+        correction: of the commands, see ``correct``; None if there is none.
         state_size: width of h and of c, 0 for "mlp"; with a mirror twice the LSTM's size: first the
             observed side, then its mirror image.
     """
@@ -97,6 +110,11 @@ class Policy:
         sides = 1 if header.mirror is None else 2
         self.state_size = sides * header.lstm if header.lstm else 0
         self.actor = Actor(header, tensors)
+        self.correction: Correction | None = None
+        if header.correction:
+            start = len("correction.")
+            named = {n[start:]: t for n, t in tensors.items() if n.startswith("correction.")}
+            self.correction = Correction(header.correction, named)
         self._lstm = [tensors[f"actor_lstm.{t}"] for t in LSTM_TENSORS] if header.lstm else []
         names = [f"actor_encoder.{i}" for i in range(len(header.encoder))]
         self._encoder = [(tensors[f"{n}.weight"], tensors[f"{n}.bias"]) for n in names]
@@ -109,6 +127,17 @@ class Policy:
     def seed(self, seed: int | None) -> None:
         """Seed the noise of ``predict(..., deterministic=False)``."""
         self._rng = np.random.default_rng(seed)
+
+    @one_thread()
+    def correct(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What to tell a low policy for it to do what ``commands`` (n, 15) ask for, (n, 15).
+
+        Only the velocities differ, and those only for a calibrated policy.
+        """
+        if self.correction is None:
+            return commands
+        with th.inference_mode():
+            return np.asarray(self.correction(th.tensor(commands)).numpy())
 
     def predict(
         self,
@@ -192,21 +221,6 @@ class Policy:
         return th.from_numpy(h), th.from_numpy(c)
 
 
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Run PyTorch on one thread, as a context manager or a decorator.
-
-    The networks are too small to parallelise: one thread costs nothing when cores are idle, is
-    several times faster when they are busy, and gives the same bits whatever the thread setting.
-    """
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    try:
-        yield
-    finally:
-        th.set_num_threads(threads)
-
-
 def load(path: str | os.PathLike[str]) -> Policy:
     """Load the policy that ``save`` wrote as ``path`` (with or without one of the two suffixes).
 
@@ -220,18 +234,17 @@ def load(path: str | os.PathLike[str]) -> Policy:
 def save_copy(
     path: str | os.PathLike[str],
     policy: Policy,
-    changed: Mapping[str, th.Tensor],
     meta: dict[str, Any],
+    correction: Correction | None = None,
 ) -> None:
-    """Write a loaded policy with some weights ``changed``, by name, and a new ``meta``.
+    """Write a loaded policy with a new ``meta``, and with a ``correction`` if one is given.
 
     Raises:
-        ValueError: as for ``save``, or a changed tensor that has no counterpart of its name and
-            shape in the policy.
+        ValueError: as for ``save``.
         OSError: the files cannot be written.
     """
-    for name, tensor in changed.items():
-        if name not in policy.tensors or tensor.shape != policy.tensors[name].shape:
-            raise ValueError(f"no tensor {name} of shape {tuple(tensor.shape)} in this policy")
-    header = dataclasses.replace(policy.header, meta=meta)
-    store(path, header, policy.tensors | dict(changed))
+    header, tensors = dataclasses.replace(policy.header, meta=meta), policy.tensors
+    if correction is not None:
+        header = dataclasses.replace(header, correction=correction.sizes)
+        tensors = tensors | correction.tensors()
+    store(path, header, tensors)

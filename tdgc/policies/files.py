@@ -9,7 +9,8 @@ critic, ``NAME.json`` describes them::
                       "actor": [256, 128],            hidden sizes
                       "critic": [256, 128],
                       "lstm": null,                   hidden size of both LSTMs; null for "mlp"
-                      "encoder": [128]},              layer sizes before both LSTMs; omitted if none
+                      "encoder": [128],               layer sizes before both LSTMs; omitted if none
+                      "correction": [15, 64, 3]},     layer sizes, see Correction; omitted if none
      "observation": {"size": 95, "actor_size": 70},   [actor part | critic-only part]
      "mirror": null,                                  or how left and right swap, see Mirror
      "action": {"size": 12, "low": [...], "high": [...]},            null: unbounded
@@ -21,11 +22,12 @@ action), ``critic.*`` likewise (the last one gives the value), ``log_std``, and 
 ``actor_lstm.*`` and ``critic_lstm.*`` with ``weight_ih``, ``weight_hh``, ``bias_ih``,
 ``bias_hh`` (gate order i, f, g, o as in PyTorch). With an encoder, ``actor_encoder.*`` and
 ``critic_encoder.*`` are its layers; actor and critic then take the LSTM's output followed by the
-encoder's.
+encoder's. With a correction, ``correction.*`` are the tensors of ``Correction``.
 """
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -106,6 +108,7 @@ class Header:
     meta: dict[str, Any]
     mirror: Mirror | None = None  # of the actor's part of the observation
     encoder: tuple[int, ...] = ()
+    correction: tuple[int, ...] = ()
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Name and shape of every tensor, in the order they are written."""
@@ -128,6 +131,12 @@ class Header:
                 shapes[f"{net}.{i}.weight"] = (size, inputs)
                 shapes[f"{net}.{i}.bias"] = (size,)
                 inputs = size
+        if self.correction:
+            for name in ("zero", "unit", "sign"):
+                shapes[f"correction.{name}"] = self.correction[:1]
+            for i, (inputs, size) in enumerate(itertools.pairwise(self.correction)):
+                shapes[f"correction.{i}.weight"] = (size, inputs)
+                shapes[f"correction.{i}.bias"] = (size,)
         return shapes
 
     def nbytes(self) -> int:
@@ -150,6 +159,7 @@ class Header:
                 "critic": list(self.critic),
                 "lstm": self.lstm,
                 **({"encoder": list(self.encoder)} if self.encoder else {}),
+                **({"correction": list(self.correction)} if self.correction else {}),
             },
             "observation": {"size": self.obs_dim, "actor_size": self.actor_dim},
             "action": {
@@ -212,8 +222,9 @@ def _table(text: str) -> dict[str, Any]:
 def _architecture(arch: Any, kind: str) -> dict[str, Any]:
     """Fields of ``Header`` from a table 'architecture' in a file of this kind."""
     if isinstance(arch, dict):
-        arch = {"encoder": []} | arch  # older files have no encoder
-    _check_keys(arch, ("activation", "actor", "critic", "lstm", "encoder"), "'architecture'")
+        arch = {"encoder": [], "correction": []} | arch  # most files lack these
+    keys = ("activation", "actor", "critic", "lstm", "encoder", "correction")
+    _check_keys(arch, keys, "'architecture'")
     if not isinstance(arch["activation"], str) or arch["activation"] not in ACTIVATIONS:
         known = ", ".join(ACTIVATIONS)
         raise PolicyFileError(f"activation {_shown(arch['activation'])}; known: {known}")
@@ -222,12 +233,16 @@ def _architecture(arch: Any, kind: str) -> dict[str, Any]:
     encoder = _sizes(arch["encoder"], "'encoder'")
     if encoder and kind != "lstm":
         raise PolicyFileError(f"'encoder' is {list(encoder)} in a file of kind '{kind}'")
+    correction = _sizes(arch["correction"], "'correction'")
+    if correction and (kind != "mlp" or len(correction) < 2 or correction[-1] > correction[0]):
+        raise PolicyFileError(f"'correction' is {list(correction)} in a file of kind '{kind}'")
     return {
         "activation": arch["activation"],
         "actor": _sizes(arch["actor"], "'actor'"),
         "critic": _sizes(arch["critic"], "'critic'"),
         "lstm": None if arch["lstm"] is None else _size(arch["lstm"], "'lstm'"),
         "encoder": encoder,
+        "correction": correction,
     }
 
 

@@ -8,6 +8,7 @@ knows nothing about rewards or tasks: ``tdgc.tasks.low_env`` trains the low poli
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +105,8 @@ class Locomotion:
         targets: (H, M, 12) rad, joint targets of the last control step and those before, as far
             back as latency reaches; 3 by default.
         carried_out: (M, 15), ``executed`` commands of the last control step.
+        correct: the low policy's correction of commands (M, 15), which the executor sets before
+            anything is observed; by default there is none.
         frequency_limit: Hz, cap on the robot's ``start_frequency``.
         layout: terms of the observation.
         delay: (M,) s, latency.
@@ -129,6 +132,7 @@ class Locomotion:
         self.nominal = nominal_pose(robot)
         self.command = np.tile(default_command(), (num_robots, 1))
         self.carried_out = self.command.copy()
+        self.correct: Callable[[Array], Array] = lambda commands: commands
         self.frequency_limit = np.inf
         self.actions = np.zeros((2, num_robots, NUM_JOINTS))
         # The rewards look two steps back.
@@ -158,6 +162,11 @@ class Locomotion:
         command[:, _FREQUENCY] += (1.0 - begun) * np.maximum(least - asked, 0)
         return command
 
+    def followed(self) -> Array:
+        """Commands (M, 15) that the low policy is told to follow: as they are carried out now, with
+        velocities at which it does what is asked."""
+        return self.correct(self.executed())
+
     def pose(self) -> Array:
         """q0, the pose to which actions are added and joint errors refer, (M, 12) rad."""
         if not self.robot.commanded_pose:
@@ -179,7 +188,7 @@ class Locomotion:
 
         Joints lag a moving target by kd / kp, so the feet are placed for that much later.
         """
-        command, middle = self.executed(), 0.5 * self.physics.control_dt
+        command, middle = self.followed(), 0.5 * self.physics.control_dt
         phases, ahead = (
             foot_phases(
                 np.mod(self.clock.clock + time * command[:, _FREQUENCY], 1.0),
@@ -310,7 +319,7 @@ def _joint_error(loco: Locomotion) -> Array:
 
 
 def _command(loco: Locomotion) -> Array:
-    return observed_command(loco.executed())
+    return observed_command(loco.followed())
 
 
 def _gait(loco: Locomotion) -> Array:

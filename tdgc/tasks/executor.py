@@ -16,6 +16,9 @@ class Acts(Protocol):
     def predict(self, obs: NDArray[np.float32]) -> tuple[NDArray[np.floating], Any]:
         """Observations (n, d) -> actions (n, 12), and a second value that is ignored here."""
 
+    def correct(self, commands: Array) -> Array:
+        """Commands (n, 15) -> what to tell the policy for it to carry them out, (n, 15)."""
+
 
 class Carries(Protocol):
     """What the closed loop needs from an executor."""
@@ -40,6 +43,7 @@ class Executor:
 
     def __init__(self, loco: Locomotion, low: Acts, noise: Noise | None = None) -> None:
         self.loco, self._low, self._noise = loco, low, noise
+        loco.correct = low.correct
         self._actions = np.zeros((loco.num_robots, NUM_JOINTS), dtype=np.float32)
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
