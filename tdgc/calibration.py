@@ -2,7 +2,7 @@
 
     python -m tdgc.calibration --low runs/low/uncalibrated --out runs/calibrated
 
-A blind policy trained with random dynamics, pushes and penalties is slower than commanded. The
+A blind policy trained with random dynamics, pushes and penalties does not walk as commanded. The
 error differs between gaits but is repeatable: on the nominal robot the mean velocity at a command
 is reproduced to 1 cm/s. So robots walk with commands of all kinds, and networks learn which
 velocity each command leads to. Another network learns which command leads to the velocity that is

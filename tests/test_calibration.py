@@ -12,7 +12,7 @@ import torch as th
 from tdgc import calibration, policies
 from tdgc.benchmark.tracking import walk_on_plane
 from tdgc.calibration import ResponseModel, learn_correction, measure
-from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, to_dict
+from tdgc.config import CommandRanges, ConfigError, LowLevelConfig, PhysicsConfig, to_dict
 from tdgc.policies import AsymmetricActorCriticPolicy, Correction, Policy
 from tdgc.sim.commands import INDEX, NAMES, SIDEWAYS
 from tdgc.sim.gaits import GAITS, gait_embedding
@@ -20,7 +20,7 @@ from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import Array
 from tdgc.tasks.low_observation import low_mirror, low_spaces
-from tdgc.tasks.pairing import PRETRAINED
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 RANGES = CommandRanges()
 MIDDLE, HALF = np.array([0.1, 0.0, 0.0]), np.array([1.1, 0.6, 1.0])  # of the velocity ranges
@@ -288,3 +288,20 @@ def test_a_corrected_policy_walks_as_it_does_at_the_corrected_commands(
                 ends.append((loco.world.state.q.copy(), loco.carried_out[:, :3]))
     assert (ends[0][0] == ends[1][0]).all()
     assert (ends[0][1] == asked[:, :3]).all()  # what is traced is what was asked
+
+
+def test_a_correction_that_cannot_be_used_is_refused(
+    low: Policy, faster: Policy, tmp_path: Path
+) -> None:
+    assert faster.correction is not None
+    tensors = {n.partition(".")[2]: t for n, t in faster.correction.tensors().items()}
+    flat = Correction((15, 2, 3), tensors)
+    flat.unit = th.zeros(15)
+    policies.save_copy(tmp_path / "flat", low, low.meta, flat)
+    with pytest.raises(policies.PolicyFileError, match="flat: the units of a correction must be"):
+        policies.load(tmp_path / "flat")
+    short = {"zero": th.zeros(4), "unit": th.ones(4), "sign": th.ones(4)}
+    short |= {"0.weight": th.zeros(3, 4), "0.bias": th.zeros(3)}
+    policies.save_copy(tmp_path / "short", low, low.meta, Correction((4, 3), short))
+    with pytest.raises(ConfigError, match="short: its correction is not one of the 15 commands"):
+        load_low(tmp_path / "short")

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import nn
 
 from tdgc.policies.correction import Correction
-from tdgc.policies.files import LSTM_TENSORS, Header, read, store
+from tdgc.policies.files import LSTM_TENSORS, Header, PolicyFileError, read, store
 
 Array = NDArray[np.float32]
 State = tuple[NDArray[np.float32], ...]
@@ -228,7 +228,10 @@ def load(path: str | os.PathLike[str]) -> Policy:
         PolicyFileError: the files cannot be used; the message is one line.
     """
     header, tensors = read(path)
-    return Policy(header, tensors)
+    try:
+        return Policy(header, tensors)
+    except PolicyFileError as error:
+        raise PolicyFileError(f"{path}: {error}") from None
 
 
 def save_copy(

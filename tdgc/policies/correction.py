@@ -46,12 +46,12 @@ class Correction(nn.Module):
         zero, unit, sign = (part[:count] for part in (self.zero, self.unit, self.sign))
         both = th.cat([commands, self.sign * commands])
         x = ((both - self.zero) / self.unit).float()
-        change = x
+        hidden = x
         for layer in self.layers[:-1]:
-            change = th.tanh(layer(change))
-        asked = x[:, :count]
+            hidden = th.tanh(layer(hidden))
+        asked, change = x[:, :count], self.layers[-1](hidden)
         limit = asked.abs().clamp(min=LIMIT)
-        velocity = th.minimum(th.maximum(asked + self.layers[-1](change), -limit), limit)
+        velocity = th.minimum(th.maximum(asked + change, -limit), limit)
         seen, mirrored = (zero + unit * velocity.double()).chunk(2)
         return th.cat([0.5 * (seen + sign * mirrored), commands[:, count:]], dim=1)
 

@@ -8,7 +8,7 @@ import numpy as np
 from tdgc import policies
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, recorded
 from tdgc.policies import Policy
-from tdgc.sim.commands import CONTINUOUS, INDEX, default_command
+from tdgc.sim.commands import CONTINUOUS, INDEX, NUM_COMMANDS, default_command
 from tdgc.sim.robot import NUM_JOINTS
 
 #: Folder of the shipped policies.
@@ -58,4 +58,7 @@ def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
     name, low = low, low if isinstance(low, Policy) else policies.load(low)
     if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
         raise ConfigError(f"{name}: not a low policy of this package")
+    sizes = low.header.correction
+    if sizes and (sizes[0], sizes[-1]) != (NUM_COMMANDS, 3):
+        raise ConfigError(f"{name}: its correction is not one of the {NUM_COMMANDS} commands")
     return low, recorded(LowLevelConfig, low.meta["config"], name)
