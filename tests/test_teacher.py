@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tdgc.config import CommandRanges, PhysicsConfig, RobotConfig
+from tdgc.config import CommandRanges, PhysicsConfig, RobotConfig, TeacherConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.terrain import CELL, Tile, TileField, make_tile
@@ -115,6 +115,16 @@ def test_walks_as_on_a_slope_only_near_it(course) -> None:
         command = course.commands()[0]
         assert command[INDEX["frequency"]] == (SLOPING if sloping else UNEVEN).frequency
         assert (command[INDEX["vy"]] > 0.0) == sloping
+
+
+@pytest.mark.parametrize(("walk_speed", "expected"), [(0.6, 0.5), (0.9, 0.75)])
+def test_among_obstacles_it_is_a_sixth_slower(course, walk_speed: float, expected: float) -> None:
+    course = course(["pillar"])
+    skill = Skill(None, TeacherConfig(walk_speed=walk_speed))
+    course.teacher = Teacher(course.field, CommandRanges(), skill)
+    course.teacher.begin(np.arange(1), course.goal, course.expects)
+    course.put(1.0)
+    assert np.hypot(*course.commands()[0, :2]) == pytest.approx(expected)
 
 
 def test_turns_to_the_goal_and_slows_before_it(course) -> None:

@@ -28,7 +28,7 @@ from tdgc.tasks.leaps import (
     steer_leap,
 )
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
-from tdgc.tasks.teacher import CAREFUL, LEAPING, SLOPING, Skill, Style, toward
+from tdgc.tasks.teacher import LEAPING, SLOPING, Skill, Style, toward
 
 #: How to walk where the family is unknown: a compromise for rough ground, stairs and slopes, with
 #: any low policy.
@@ -51,7 +51,7 @@ def styles(skill: Skill) -> dict[str, Style]:
     """How to walk on each family with a low policy of this ``skill``."""
     return {
         "rough": skill.uneven,
-        "pillar": dataclasses.replace(skill.uneven, speed=CAREFUL),
+        "pillar": skill.among_obstacles,
         "stair": skill.uneven,
         "gap": dataclasses.replace(LEAPING, speed=skill.manner.leap_speed),
         "tilt": SLOPING,
@@ -162,7 +162,7 @@ class CuesLaw:
         chosen = [self._styles.get(name, UNKNOWN) for name in memory.told]
         command = np.array([style.command() for style in chosen])
         fast = np.array([style.speed for style in chosen])
-        fast[memory.pillar] = CAREFUL
+        fast[memory.pillar] = self._styles["pillar"].speed
         error, goal = bearing.copy(), np.array([GOAL_X, 0.0])
         for i in np.flatnonzero(memory.pillar).tolist():
             heading, at = memory.where.heading[0, i], memory.where.position[0, i]

@@ -82,8 +82,6 @@ UNEVEN = Style(
     duration=0.55,
     pitch=-0.07,
 )
-#: m/s, speed among obstacles.
-CAREFUL = 0.5
 #: Style on lateral slopes.
 SLOPING = Style(0.6, frequency=3.5, swing_height=0.14, uphill=0.45)
 #: Style of leaps, in pronk, see ``tdgc.tasks.leaps``.
@@ -108,6 +106,11 @@ class Skill:
         """Style on steps and bumps, and wherever there is no reason for another."""
         manner = self.manner
         return replace(UNEVEN, speed=manner.walk_speed, frequency=manner.step_frequency)
+
+    @property
+    def among_obstacles(self) -> Style:
+        """Style among obstacles: a sixth slower, 0.5 m/s in the usual manner."""
+        return replace(self.uneven, speed=5.0 * self.manner.walk_speed / 6.0)
 
 
 #: m ahead at which the probes see a trench; they reach 1.2 m.
@@ -177,6 +180,7 @@ class Teacher:
         self._slope = np.zeros((m, TILE_SAMPLES, field.heights.shape[1]))
         self._costs: dict[int, Array] = {}  # of travelling, on tiles with obstacles
         self._walk_speed, self._wanted_speed = skill.manner.walk_speed, skill.manner.leap_speed
+        self._careful = skill.among_obstacles.speed
         self._plan = LeapPlan(m, ranges, speed=self._wanted_speed)
         self._leap_speed = min(self._wanted_speed, ranges.vx[1])
         self._start = np.full(m, -np.inf)  # m, x where a robot starts to leap
@@ -228,7 +232,7 @@ class Teacher:
         sloping = slope != 0.0
         command = np.where(sloping[:, None], self._sloping, self._uneven)
         top_speed = np.where(sloping, SLOPING.speed, self._walk_speed)
-        top_speed[detour] = CAREFUL
+        top_speed[detour] = self._careful
         climb = SLOPING.uphill * np.sin(np.arctan(slope))
         self.other = command.copy()
         for way, toward_bearing in ((command, bearing), (self.other, second)):
