@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import nn
 
-from tdgc.policies.correction import Correction
+from tdgc.policies.correction import Correction, frozen_linear
 from tdgc.policies.files import LSTM_TENSORS, Header, PolicyFileError, read, store
 
 Array = NDArray[np.float32]
@@ -21,21 +21,6 @@ State = tuple[NDArray[np.float32], ...]
 _FUNCTIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
     "elu": F.elu, "relu": th.relu, "tanh": th.tanh
 }  # fmt: skip
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Run PyTorch on one thread, as a context manager or a decorator.
-
-    The networks are too small to parallelise: one thread costs nothing when cores are idle, is
-    several times faster when they are busy, and gives the same bits whatever the thread setting.
-    """
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    try:
-        yield
-    finally:
-        th.set_num_threads(threads)
 
 
 class Actor(nn.Module):
@@ -48,12 +33,10 @@ class Actor(nn.Module):
     def __init__(self, header: Header, tensors: Mapping[str, th.Tensor]) -> None:
         super().__init__()
         self.activation = _FUNCTIONS[header.activation]
-        self.layers = nn.ModuleList()
-        for i in range(len(header.actor) + 1):
-            weight, bias = tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]
-            layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
-            layer.load_state_dict({"weight": weight, "bias": bias}, assign=True)
-            self.layers.append(layer.requires_grad_(False))
+        self.layers = nn.ModuleList(
+            frozen_linear(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"])
+            for i in range(len(header.actor) + 1)
+        )
         self.recurrent = header.lstm is not None
         self.mirror: tuple[th.Tensor, ...] | None = None
         if header.mirror is not None:
@@ -128,7 +111,6 @@ class Policy:
         """Seed the noise of ``predict(..., deterministic=False)``."""
         self._rng = np.random.default_rng(seed)
 
-    @one_thread()
     def correct(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
         """What to tell a low policy for it to do what ``commands`` (n, 15) ask for, (n, 15).
 
@@ -136,7 +118,7 @@ class Policy:
         """
         if self.correction is None:
             return commands
-        with th.inference_mode():
+        with one_thread(), th.inference_mode():
             return np.asarray(self.correction(th.tensor(commands)).numpy())
 
     def predict(
@@ -219,6 +201,21 @@ class Policy:
             start = np.broadcast_to(np.asarray(episode_start, dtype=bool), n)
             h[start] = c[start] = 0.0
         return th.from_numpy(h), th.from_numpy(c)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Run PyTorch on one thread, as a context manager or a decorator.
+
+    The networks are too small to parallelise: one thread costs nothing when cores are idle, is
+    several times faster when they are busy, and gives the same bits whatever the thread setting.
+    """
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(threads)
 
 
 def load(path: str | os.PathLike[str]) -> Policy:

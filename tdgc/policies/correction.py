@@ -12,6 +12,13 @@ from tdgc.policies.files import PolicyFileError
 LIMIT = 1.2
 
 
+def frozen_linear(weight: th.Tensor, bias: th.Tensor) -> nn.Linear:
+    """A linear layer of these tensors, not copied and not trained."""
+    layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
+    layer.load_state_dict({"weight": weight, "bias": bias}, assign=True)
+    return layer.requires_grad_(False)
+
+
 class Correction(nn.Module):
     """Replaces the velocities, the first values of commands, as a network says: (n, c) -> (n, c).
 
@@ -34,12 +41,10 @@ class Correction(nn.Module):
         self.zero, self.unit, self.sign = (tensors[n].double() for n in ("zero", "unit", "sign"))
         if not bool((self.unit > 0.0).all()):
             raise PolicyFileError("the units of a correction must be above 0")
-        self.layers = nn.ModuleList()
-        for i in range(len(self.sizes) - 1):
-            weight, bias = tensors[f"{i}.weight"], tensors[f"{i}.bias"]
-            layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
-            layer.load_state_dict({"weight": weight, "bias": bias}, assign=True)
-            self.layers.append(layer.requires_grad_(False))
+        self.layers = nn.ModuleList(
+            frozen_linear(tensors[f"{i}.weight"], tensors[f"{i}.bias"])
+            for i in range(len(self.sizes) - 1)
+        )
 
     def forward(self, commands: th.Tensor) -> th.Tensor:
         count = self.sizes[-1]
