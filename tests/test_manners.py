@@ -23,9 +23,11 @@ def test_leaps_are_planned_for_the_usual_speed() -> None:
     [
         ((14, 35, 44), 1.0, 3),
         ((26, 45, 45), 1.1, 3),  # the earlier of equals
-        ((40, 44, 43), 1.2, 3),  # hardly better
-        ((40, 44, 45), 1.0, 3),
-        ((44, 48, 48), 1.2, 1),  # of 48 robots, no more than 4 can be gained
+        ((26, 42, 45), 1.1, 3),  # or of near ties
+        ((26, 42, 46), 1.0, 3),
+        ((41, 44, 43), 1.2, 3),  # hardly better
+        ((41, 44, 45), 1.1, 3),
+        ((45, 48, 48), 1.2, 1),  # of 48 robots, no more than 3 can be gained
     ],
 )
 def test_something_unusual_has_to_be_clearly_better(

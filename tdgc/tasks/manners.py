@@ -26,9 +26,9 @@ LEAPS = (1.1, 1.0)
 ROBOTS = 48
 _FIRST = 5  # lowest level; the robots are dealt to it and to those above it
 _SEED = 0
-# How many more of the robots must arrive for something else to be preferred to the usual, so that
-# near ties, which another machine may decide differently, change nothing.
-_BETTER = 5
+# How many more of the robots must arrive for a manner to be preferred to one that is nearer to the
+# usual, so that near ties, which another machine may decide differently, change nothing.
+_BETTER = 4
 
 
 def may_leap(env: HighLevelConfig) -> bool:
@@ -92,16 +92,18 @@ def manner_of(high: Policy, source: object) -> TeacherConfig:
 def choose(
     trial: Callable[[TeacherConfig], int], manners: Sequence[TeacherConfig]
 ) -> TeacherConfig:
-    """Choose the manner with which most robots arrive in a trial, the earlier of equals.
+    """Choose the manner with which most robots arrive in a trial.
 
-    The first, usual one stays unless another is clearly better; if none can be, no other is tried.
+    One is preferred to another before it in the sequence, which begins with the usual one, only if
+    it is clearly better. If nothing can be clearly better than the usual one, no other is tried.
     """
     usual, *others = manners
-    least = trial(usual) + _BETTER
-    if least > ROBOTS:
+    arrived = [trial(usual)]
+    if arrived[0] + _BETTER > ROBOTS:
         return usual
-    arrived = [trial(manner) for manner in others]
-    return others[int(np.argmax(arrived))] if max(arrived) >= least else usual
+    arrived += [trial(manner) for manner in others]
+    close = [number + _BETTER > max(arrived) for number in arrived]
+    return manners[close.index(True)]
 
 
 def arrivals(
