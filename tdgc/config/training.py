@@ -170,7 +170,7 @@ class HighTrainConfig:
     seed: Whole = 42
     n_envs: Count = 100
     workers: Count = 2
-    steps: Count = 2_100_000  # decisions over all robots: under 80 minutes on two cores
+    steps: Count = 2_100_000  # decisions over all robots: 80 minutes to 3 hours on two cores
     log_steps: Count = 24_000
     checkpoint_seconds: NotNegative = 30.0  # with the update under way, less than a minute is lost
     start_speed: float = 0.5  # m/s: the untrained policy walks straight ahead in the default gait
