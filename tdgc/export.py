@@ -460,13 +460,13 @@ def _stage(pair: Pair, controller: Controller) -> tuple[Locomotion, Array, Array
 
     What the simulator observes of it are the policies' own configurations.
     """
-    config, field = pair.low_config, TileField((1, 1))
-    field.place(0, 0, make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
+    tile = make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0))
+    config, field = pair.low_config, TileField.of(tile)
     physics = dataclasses.replace(config.physics, control_dt=controller.dt)
     world = World(1, controller.robot(), physics, field)
     loco = Locomotion(1, config.robot, config.physics, field, config.gyro, world=world)
     loco.correct = pair.low.correct
-    return loco, field.starts[:, 0], field.goals[:, 0]
+    return loco, field.starts, field.goals
 
 
 def _act(

@@ -69,7 +69,7 @@ class Notes:
         self.rows: list[dict[str, Array]] = []
 
     def begin(self, batch: Batch) -> None:
-        self._loco, self._origin = batch.loco, batch.field.origin(1, 0)
+        self._loco, self._origin = batch.loco, batch.field.origin(1)
 
     def step(self, step: int, live: Array, outcome: Array) -> None:
         state = self._loco.world.state

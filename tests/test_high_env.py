@@ -162,9 +162,9 @@ def test_mirrored_robots_see_mirrored_things(cues):
     tile = make_tile("pillar", 1.0, rng)
     image = dataclasses.replace(tile, heights=tile.heights[:, ::-1], support=tile.support[:, ::-1])
     for row, placed in enumerate((tile, image)):
-        task.field.place(row, 0, placed)
+        task.field.place(row, placed)
     task.reset(np.arange(2))
-    origin, middle = task.field.origin(np.arange(2), 0), TILE_SIZE / 2
+    origin, middle = task.field.origin(np.arange(2)), TILE_SIZE / 2
     task.goal[:] = origin + [[7.25, middle + 0.6], [7.25, middle - 0.6]]
     command = task.decoder.decode(rng.uniform(-1.0, 1.0, 13))
     mirror = high_mirror(config)
@@ -329,7 +329,7 @@ def test_curriculum_moves_levels_and_redraws_tiles():
             assert truncated.all() and not terminated.any()
             task.reset(np.arange(2))
         assert task.curriculum.levels.tolist() == [1, 0]
-        rises = [task.field.features[k, 0].risers[0, 1] for k in range(2)]
+        rises = [task.field.features[k].risers[0, 1] for k in range(2)]
         assert rises == pytest.approx([0.042, 0.03])  # d = 0.1 and d = 0
     finally:
         task.close()
@@ -429,7 +429,7 @@ def test_a_teacher_shows_the_second_way_around_pillars():
         task.reset(np.arange(40))
         task.locomotion.place(
             np.arange(40),
-            np.array([task.field.features[i, 0].pillars[0, :2] for i in range(40)])
+            np.array([task.field.features[i].pillars[0, :2] for i in range(40)])
             + task._origin
             - [0.5, 0.0],
             np.zeros(40),

@@ -420,13 +420,13 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
     task = LowLevelTask(config, 2, seed=0, training=False)
     assert task.field is not None
     for row, tile in enumerate(slanted_stairs()):
-        task.field.place(row, 0, tile)
+        task.field.place(row, tile)
     loco, state = task.locomotion, task.locomotion.world.state
     loco.world.upload_terrain()
     loco.world.friction[:], loco.world.payload[:], loco.delay[:] = 0.6, 1.5, 0.012
     rng = np.random.default_rng(6)
     mirror_commands(loco, rng, gait=0)
-    origin = task.field.origin(np.arange(2), 0)
+    origin = task.field.origin(np.arange(2))
     pitch, middle = origin[1, 0], origin[0, 1] + TILE_SIZE / 2
     xy = np.array([[2.35, middle + 0.3], [2.35 + pitch, middle - 0.3]])
     loco.place(np.arange(2), xy, np.array([0.4, -0.4]), loco.clock.clock.copy())

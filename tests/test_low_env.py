@@ -57,7 +57,7 @@ def begin(config: LowLevelConfig, robots: int = 1, training: bool = False) -> Lo
 def put(task: LowLevelTask, robot: int, local_xy: tuple[float, float], yaw: float = 0.0) -> None:
     """Place a robot at a point given in its tile's frame."""
     assert task.field is not None
-    xy = task.field.origin([robot], 0) + np.array([local_xy])
+    xy = task.field.origin([robot]) + np.array([local_xy])
     task.locomotion.place(np.array([robot]), xy, np.array([yaw]), np.zeros(1))
 
 
@@ -291,10 +291,10 @@ def test_a_robot_in_a_trench_has_failed_and_one_on_a_step_has_not() -> None:
     task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 2)
     assert task.field is not None
     for row, family in enumerate(("gap", "stair")):
-        task.field.place(row, 0, make_tile(family, 1.0, np.random.default_rng(0)))
+        task.field.place(row, make_tile(family, 1.0, np.random.default_rng(0)))
     world = task.locomotion.world
-    trench = task.field.features[0, 0].trenches[0].mean()
-    risers = task.field.features[1, 0].risers
+    trench = task.field.features[0].trenches[0].mean()
+    risers = task.field.features[1].risers
     up, top = len(risers) // 2, 0.15 * len(risers) / 2
     stairs = 161 * 0.05 + risers[up - 1 : up + 1, 0].mean()  # the landing between the flights
     state = world.state
@@ -396,7 +396,7 @@ def test_a_crossing_robot_is_sent_to_its_waypoint(yaw: float) -> None:
     put(task, 0, (2.0, 3.5), yaw)
     free = task.locomotion.command[1].copy()
     task.episodes.speed[:], task.episodes.facing[:] = 0.5, 0.4
-    origin = task.field.origin(0, 0)
+    origin = task.field.origin(0)
     task.episodes.waypoint[0] = origin + [7.25, 4.5]
     task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     vx, vy, turning = task.locomotion.command[0, :3]
@@ -419,7 +419,7 @@ def test_crossing_velocities_keep_their_direction_within_the_ranges() -> None:
     assert task.field is not None
     task.episodes.crossing[:], task.episodes.facing[:], task.episodes.speed[:] = True, 0.0, 1.0
     put(task, 0, (2.0, 4.0), -math.pi / 2)
-    task.episodes.waypoint[0] = task.field.origin(0, 0) + [7.25, 4.0]
+    task.episodes.waypoint[0] = task.field.origin(0) + [7.25, 4.0]
     task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
     np.testing.assert_allclose(task.locomotion.command[0, :3], [0.0, 0.6, 1.0], atol=1e-9)
     put(task, 0, (2.0, 4.0), -math.pi / 4)
@@ -452,7 +452,7 @@ def test_an_episode_ends_with_the_crossing() -> None:
     task = begin(dataclasses.replace(TILES, families=("tilt",)))
     assert task.field is not None
     task.episodes.crossing[:] = True
-    origin = task.field.origin(0, 0)
+    origin = task.field.origin(0)
     task.episodes.waypoint[0] = origin + [7.25, 4.4]
     put(task, 0, (6.7, 4.4))
     task.crossings.steer(task.locomotion, task.ground, np.arange(task.num_robots))
@@ -563,7 +563,7 @@ def test_a_new_level_is_a_new_tile() -> None:
     task.reset(np.array([1]))
     assert (task.field.heights[:161] == before).all()
     assert np.diff(task.field.heights[161:, 0]).max() == pytest.approx(0.114)
-    risers = task.field.features[1, 0].risers
+    risers = task.field.features[1].risers
     up = len(risers) // 2
     put(task, 1, (risers[up - 1 : up + 1, 0].mean(), 4.0))
     for _ in range(25):
@@ -580,7 +580,7 @@ def test_robots_of_flat_tiles_are_free_and_start_in_the_middle() -> None:
     task = begin(config, 40, training=True)
     assert task.field is not None
     assert not task.episodes.crossing[0::2].any() and task.episodes.crossing[1::2].any()
-    local = task.locomotion.world.state.position[:, :2] - task.field.origin(np.arange(40), 0)
+    local = task.locomotion.world.state.position[:, :2] - task.field.origin(np.arange(40))
     np.testing.assert_allclose(local[0::2], 4.0)
     np.testing.assert_allclose(local[1::2, 0], 0.75)
     task.step(still(task))
@@ -693,7 +693,7 @@ def test_pitch_follows_the_slope_of_a_crossing() -> None:
         [0.5, 0.0],
         0.05,
     )
-    risers = task.field.features[0, 0].risers
+    risers = task.field.features[0].risers
     put(task, 0, (risers[2:4, 0].mean(), 4.0))
     put(task, 1, (risers[2:4, 0].mean(), 4.0))
     task.ground = measure_ground(task.locomotion)
@@ -726,7 +726,7 @@ def ended(
     config = dataclasses.replace(TILES, families=("stair",), randomisation=quiet)
     task = LowLevelTask(config, 1, seed=0, training=training)
     assert task.field is not None
-    task.field.place(0, 0, make_tile("tilt", 0.0, np.random.default_rng(0)))
+    task.field.place(0, make_tile("tilt", 0.0, np.random.default_rng(0)))
     task.locomotion.world.upload_terrain()
     task.reset(np.arange(1))
     put(task, 0, (local_x, 4.0))
@@ -910,8 +910,8 @@ def test_trenches_under_the_hips_count_as_filled() -> None:
     """The trunk's height is above the support surface; the probes see the trench."""
     task = begin(dataclasses.replace(TILES, families=("gap",)))
     assert task.field is not None
-    task.field.place(0, 0, make_tile("gap", 1.0, np.random.default_rng(0)))
-    trench = task.field.features[0, 0].trenches[0].mean()
+    task.field.place(0, make_tile("gap", 1.0, np.random.default_rng(0)))
+    trench = task.field.features[0].trenches[0].mean()
     loco = task.locomotion
     loco.world.state.position[:] = [[trench - loco.world.state.geometry.hips[0, 0], 2.0, 0.31]]
     loco.world.state.derive()

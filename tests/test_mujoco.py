@@ -38,9 +38,9 @@ def make_world(
     family: str = "", level: int = 0, robot: RobotConfig = ROBOT, **settings: float
 ) -> MujocoWorld:
     """A robot on a tile of ``family``, or on level ground if that is empty."""
-    field, config = TileField((1, 1)), MujocoConfig(**settings)  # type: ignore[arg-type]
+    field, config = TileField(1), MujocoConfig(**settings)  # type: ignore[arg-type]
     if family:
-        field.place(0, 0, tile_of(0, family, level, 0))
+        field.place(0, tile_of(0, family, level, 0))
     return MujocoWorld(robot, config.physics(0.02, 200.0), field, config)
 
 
@@ -205,7 +205,7 @@ def test_meshes_are_found_beside_the_urdf(visual: bool, tmp_path: Path) -> None:
     (tmp_path / "meshes" / "trunk.obj").write_text(f"{corners}f 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n")
     robot = dataclasses.replace(ROBOT, urdf=str(tmp_path / "robot.urdf"))
     config = MujocoConfig()
-    world = MujocoWorld(robot, config.physics(0.02, 200.0), TileField((1, 1)), config, visual)
+    world = MujocoWorld(robot, config.physics(0.02, 200.0), TileField(1), config, visual)
     assert world.model.nmesh == 1
 
 

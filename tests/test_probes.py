@@ -26,13 +26,13 @@ ROBOTS = 8
 @pytest.fixture
 def loco() -> Iterator[Locomotion]:
     """Robots 0.6 m before the first trench of their tiles."""
-    field = TileField((ROBOTS, 1))
+    field = TileField(ROBOTS)
     for k in range(ROBOTS):
-        field.place(k, 0, make_tile("gap", 1.0, np.random.default_rng(k)))
+        field.place(k, make_tile("gap", 1.0, np.random.default_rng(k)))
     loco = Locomotion(ROBOTS, RobotConfig(), PhysicsConfig(), field)
     rows = np.arange(ROBOTS)
-    lips = np.array([field.features[k, 0].trenches[0, 0] for k in range(ROBOTS)])
-    xy = field.origin(rows, 0) + np.column_stack([lips - 0.6, np.full(ROBOTS, 4.0)])
+    lips = np.array([field.features[k].trenches[0, 0] for k in range(ROBOTS)])
+    xy = field.origin(rows) + np.column_stack([lips - 0.6, np.full(ROBOTS, 4.0)])
     loco.place(rows, xy, np.zeros(ROBOTS), np.zeros(ROBOTS))
     yield loco
     loco.world.close()

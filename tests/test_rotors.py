@@ -78,7 +78,7 @@ def test_a_robot_in_the_air_moves_as_in_mujoco(substeps: int, joints: float, tru
     def mujoco(armature: float) -> Array:
         config = MujocoConfig(timestep=0.02 / substeps, armature=armature)
         physics = config.physics(0.02, 25.0 * substeps)
-        return flight(MujocoWorld(ROBOT, physics, TileField((1, 1)), config))
+        return flight(MujocoWorld(ROBOT, physics, TileField(1), config))
 
     physics = PhysicsConfig(substeps=substeps)
     error = np.abs(flight(bullet(physics, ROTOR)) - mujoco(ROTOR)).mean(axis=0)

@@ -17,11 +17,11 @@ from tdgc.tasks.rules import OUTCOMES, has_failed, is_fallen, outcome
 @pytest.fixture
 def loco() -> Iterator[Locomotion]:
     """Five robots in the middle of level tiles."""
-    field = TileField((5, 1))
+    field = TileField(5)
     for k in range(5):
-        field.place(k, 0, make_tile("tilt", 0.0, np.random.default_rng(k)))
+        field.place(k, make_tile("tilt", 0.0, np.random.default_rng(k)))
     loco = Locomotion(5, RobotConfig(), PhysicsConfig(), field)
-    xy = field.origin(np.arange(5), 0) + [4.0, 4.0]
+    xy = field.origin(np.arange(5)) + [4.0, 4.0]
     loco.place(np.arange(5), xy, np.zeros(5), np.zeros(5))
     yield loco
     loco.world.close()

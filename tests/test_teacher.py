@@ -35,11 +35,11 @@ class Course:
 
     def __init__(self, grounds: list[str | Heights], level: int) -> None:
         rng = np.random.default_rng(0)
-        self.field = TileField((len(grounds), 1))
+        self.field = TileField(len(grounds))
         for k, kind in enumerate(grounds):
             tile = make_tile(kind, level / 10, rng) if isinstance(kind, str) else ground(kind)
-            self.field.place(k, 0, tile)
-        self.origin = self.field.origin(np.arange(len(grounds)), 0)
+            self.field.place(k, tile)
+        self.origin = self.field.origin(np.arange(len(grounds)))
         self.loco = Locomotion(len(grounds), RobotConfig(), PhysicsConfig(), self.field)
         self.goal = self.origin + [7.25, 4.0]
         self.expects = np.array([family == "gap" for family in grounds])
@@ -90,7 +90,7 @@ def test_the_ground_decides_how_to_walk(course) -> None:
 
 def test_goes_uphill_across_a_slope(course) -> None:
     course = course(["tilt", "rough"])
-    slope = course.field.features[0, 0].slope
+    slope = course.field.features[0].slope
     climb = SLOPING.uphill * np.sin(slope)
     assert abs(climb) > 0.1
     for yaw in (0.0, 0.3):
@@ -147,7 +147,7 @@ def test_leaps_face_across_the_trenches_and_end_behind_them(course) -> None:
     assert command[INDEX["vx"]] == pytest.approx(1.2 * np.cos(bearing - 0.2))
     assert command[INDEX["vy"]] == pytest.approx(1.2 * np.sin(bearing - 0.2))
     assert command[INDEX["yaw_rate"]] == pytest.approx(-0.3)
-    course.put(course.field.features[0, 0].trenches[-1, 1] + 0.55)
+    course.put(course.field.features[0].trenches[-1, 1] + 0.55)
     command = course.commands()
     assert gait_index(command[0]) == 0 and command[0, INDEX["frequency"]] == UNEVEN.frequency
 
@@ -223,7 +223,7 @@ def test_a_policy_that_does_not_leap_walks_over_trenches(course) -> None:
 
 def test_who_is_not_told_of_trenches_leaps_when_it_sees_one(course) -> None:
     course = course(["gap"])
-    lip = course.field.features[0, 0].trenches[0, 0]
+    lip = course.field.features[0].trenches[0, 0]
     course.expects[:] = False
     course.lead(Landing())
     course.put(lip - SIGHT - 0.05)

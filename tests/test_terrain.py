@@ -476,47 +476,56 @@ def test_seeds_must_be_one_word(seed):
 
 @pytest.fixture(scope="module")
 def grid() -> TileField:
-    """The paper's grid: rows are levels, columns are families."""
-    field = TileField((2, 3))
-    for row, level in enumerate((2, 7)):
-        for col, family in enumerate(("stair", "rough", "mixed")):
-            field.place(row, col, make_tile(family, level / 10, tile_rng(3, family, level, 0)))
+    """Three tiles, 1 m of which is cut off on both sides."""
+    field = TileField(3, crop=1.0)
+    for k, tile in enumerate(tiles()):
+        field.place(k, tile)
     return field
 
 
-def test_grid_rows_are_levels_and_columns_families(grid):
-    assert grid.shape == (2, 3)
-    assert grid.heights.shape == grid.support.shape == (322, 483)
+def tiles() -> list[Tile]:
+    kinds = ("stair", 2), ("rough", 7), ("gap", 5)
+    return [make_tile(name, level / 10, tile_rng(3, name, level, 0)) for name, level in kinds]
+
+
+def test_a_field_holds_its_tiles_one_behind_the_other(grid):
+    assert grid.count == 3 and grid.heights.shape == grid.support.shape == (483, 121)
     assert grid.heights.dtype == np.float32 and grid.heights.flags.c_contiguous
-    for row, level in enumerate((2, 7)):
-        for col, family in enumerate(("stair", "rough", "mixed")):
-            made = make_tile(family, level / 10, tile_rng(3, family, level, 0))
-            where = np.s_[161 * row : 161 * (row + 1), 161 * col : 161 * (col + 1)]
-            np.testing.assert_array_equal(grid.heights[where], made.heights)
-            np.testing.assert_array_equal(grid.support[where], made.support)
-            np.testing.assert_array_equal(grid.starts[row, col], made.start)
-            np.testing.assert_array_equal(grid.goals[row, col], made.goal)
-            np.testing.assert_allclose(grid.origin(row, col), [8.05 * row, 8.05 * col])
+    for k, made in enumerate(tiles()):
+        where = slice(161 * k, 161 * (k + 1))
+        np.testing.assert_array_equal(grid.heights[where], made.heights[:, 20:141])
+        np.testing.assert_array_equal(grid.support[where], made.support[:, 20:141])
+        np.testing.assert_array_equal(grid.starts[k], made.start)
+        np.testing.assert_array_equal(grid.goals[k], made.goal)
+        np.testing.assert_array_equal(grid.features[k].trenches, made.features.trenches)
+        np.testing.assert_allclose(grid.origin(k), [8.05 * k, -1.0])
+
+
+def test_a_field_of_tiles_cannot_change():
+    field = TileField.of(*tiles())
+    np.testing.assert_array_equal(field.heights[161:322], tiles()[1].heights)
+    with pytest.raises(ValueError, match="read-only"):
+        field.place(0, tiles()[1])
 
 
 def test_origin_takes_arrays(grid):
-    np.testing.assert_allclose(grid.origin([0, 1], [2, 0]), [[0, 16.1], [8.05, 0]])
+    np.testing.assert_allclose(grid.origin([0, 2]), [[0, -1], [16.1, -1]])
 
 
 def test_on_tile(grid):
     x = 8.05 + np.array([-0.01, 0.01, 7.99, 8.01, 4.0, 4.0, 4.0])
-    y = 16.1 + np.array([4.0, 4.0, 4.0, 4.0, -0.01, 0.01, 8.01])
+    y = np.array([3.0, 3.0, 3.0, 3.0, -0.01, 0.01, 6.01])
     expected = [False, True, True, False, False, True, False]
-    assert grid.on_tile(1, 2, x, y).tolist() == expected
-    np.testing.assert_array_equal(grid.on_tile([1, 0], [2, 2], 12.0, 20.0), [True, False])
+    assert grid.on_tile(1, x, y).tolist() == expected
+    np.testing.assert_array_equal(grid.on_tile([1, 0], 12.0, 3.0), [True, False])
 
 
 def test_a_tile_takes_anothers_place_in_the_same_buffers():
-    field = TileField((2, 1))
+    field = TileField(2)
     heights, support = field.heights, field.support
     tiles = [make_tile("rough", 0.3, tile_rng(1, "rough", 3, index)) for index in (0, 1)]
     for tile in tiles:
-        field.place(1, 0, tile)
+        field.place(1, tile)
     assert field.heights is heights and field.support is support
     np.testing.assert_array_equal(heights[161:], tiles[1].heights)
     assert (heights[:161] == 0.0).all()
@@ -531,7 +540,7 @@ def test_tiles_of_training_and_evaluation_differ():
 
 
 def test_height_at_follows_bullets_triangles():
-    grid = TileField((1, 1))
+    grid = TileField(1)
     # One cell with corners a = [4, 6], b = [5, 6], c = [4, 7], e = [5, 7]; its diagonal is b-c.
     a, b, c, e = 0.1, 0.3, -0.2, 0.7
     grid.heights[4:6, 6:8] = [[a, c], [b, e]]
@@ -560,9 +569,9 @@ def test_there_is_no_height_where_a_robot_that_blew_up_is(grid):
 
 
 def test_height_at_hits_every_sample_and_clamps_outside(grid):
-    ix, iy = np.meshgrid(np.arange(322), np.arange(483), indexing="ij")
+    ix, iy = np.meshgrid(np.arange(483), np.arange(121), indexing="ij")
     np.testing.assert_allclose(grid.height_at(ix * 0.05, iy * 0.05), grid.heights, atol=1e-6)
-    grid = TileField((1, 1))
+    grid = TileField(1)
     grid.heights[0, 0], grid.heights[-1, -1], grid.heights[80, -1] = 1, 2, 3
     assert grid.height_at(-5.0, -5.0) == pytest.approx(1)
     assert grid.height_at(99.0, 99.0) == pytest.approx(2)

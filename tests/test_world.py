@@ -75,10 +75,10 @@ def plane() -> Iterator[World]:
 
 
 def tiles(families: list[str], level: int = 10, crop: float = 2.0, seed: int = 0) -> TileField:
-    """A field with one row per robot and one tile per row."""
-    field = TileField((len(families), 1), crop=crop)
+    """A field with one tile per robot."""
+    field = TileField(len(families), crop=crop)
     for i, family in enumerate(families):
-        field.place(i, 0, make_tile(family, level / 10, tile_rng(seed, family, level, i)))
+        field.place(i, make_tile(family, level / 10, tile_rng(seed, family, level, i)))
     return field
 
 
@@ -91,7 +91,7 @@ def assert_rays_hit_the_field(world: World, seed: int) -> None:
     assert field is not None
     for row in range(world.num_robots):
         local = rng.uniform([0.001, field.crop + 0.001], [7.999, 7.999 - field.crop], (200, 2))
-        xy = local + field.origin(row, 0)
+        xy = local + field.origin(row)
         heights = field.height_at(xy[:, 0], xy[:, 1])
         ends = np.full((200, 1), 3.0)
         client = world._client_of[row]
@@ -119,12 +119,12 @@ def test_heightfield_of_several_clients_and_after_a_redraw() -> None:
     assert [client.robots for client in world._clients] == [(0, 6), (6, 12)]
     assert_rays_hit_the_field(world, 1)
     for row, family in enumerate(reversed(families * 2)):
-        field.place(row, 0, make_tile(family, 0.8, np.random.default_rng(row)))
+        field.place(row, make_tile(family, 0.8, np.random.default_rng(row)))
     world.upload_terrain()
     assert_rays_hit_the_field(world, 2)
     # Redraw a single tile, in the second client.
     before = field.heights.copy()
-    field.place(7, 0, make_tile("tilt", 1.2, np.random.default_rng(99)))
+    field.place(7, make_tile("tilt", 1.2, np.random.default_rng(99)))
     assert (field.heights != before).any()
     world.upload_terrain([7])
     assert_rays_hit_the_field(world, 3)
@@ -133,9 +133,9 @@ def test_heightfield_of_several_clients_and_after_a_redraw() -> None:
 
 def test_a_field_that_never_changes_is_uploaded_as_flat_as_it_is() -> None:
     families = ["rough", "gap", "gap", "gap", "gap", "gap", "pillar", "stair", "tilt", "mixed"]
-    for field in (tiles(families), tiles(["gap"] * 12), TileField((1, 1), crop=2.0)):
+    for field in (tiles(families), tiles(["gap"] * 12), TileField(1, crop=2.0)):
         field.heights.setflags(write=False)
-        world = World(field.shape[0], ROBOT, PHYSICS, field)
+        world = World(field.count, ROBOT, PHYSICS, field)
         assert_rays_hit_the_field(world, 5)
         for client in world._clients:
             heights = field.heights[client.samples]
@@ -159,10 +159,10 @@ def test_a_robot_walks_alike_on_a_field_that_never_changes() -> None:
 def test_a_robot_stands_on_its_own_tile_in_every_client() -> None:
     """On eleven flat tiles of different heights, each robot stands 0.28 m above its own."""
     ground = np.linspace(-0.5, 0.5, 11)
-    field = TileField((11, 1), crop=2.9)
+    field = TileField(11, crop=2.9)
     field.heights += np.repeat(ground, 161)[:, None].astype(np.float32)
     world = World(11, ROBOT, PHYSICS, field)
-    position = np.column_stack([field.origin(np.arange(11), 0) + [0.75, 4.0], ground + STAND])
+    position = np.column_stack([field.origin(np.arange(11)) + [0.75, 4.0], ground + STAND])
     upright = yaw_quaternion(np.zeros(11))
     world.reset_robots(np.arange(11), position, upright, np.tile(NOMINAL, (11, 1)))
     hold(world, 50)
@@ -179,18 +179,16 @@ def test_ground_of_a_plane_and_support_of_tiles(plane: World) -> None:
     for row, extreme in ((0, -0.6), (1, 0.8)):
         part = field.heights[row * 161 : (row + 1) * 161]
         ix, iy = np.argwhere(np.isclose(part, extreme))[0]
-        at = field.origin(row, 0) + np.array([ix, iy]) * field.cell
+        at = field.origin(row) + np.array([ix, iy]) * 0.05
         assert world.ground_height(at[0], at[1]) == pytest.approx(extreme, abs=1e-4)
         assert world.support_height(at[0], at[1]) == pytest.approx(0.0, abs=1e-9)
     world.close()
 
 
 def test_fields_that_do_not_fit() -> None:
-    with pytest.raises(ValueError, match=r"^3 robots need as many tile rows, not 2$"):
-        World(3, ROBOT, PHYSICS, TileField((2, 1)))
-    with pytest.raises(ValueError, match=r"^Bullet holds 2097152 samples a field, not 2332890$"):
-        World(10, ROBOT, PHYSICS, TileField((10, 9)))
-    field = TileField((1, 1), crop=2.9)
+    with pytest.raises(ValueError, match=r"^3 robots need as many tiles, not 2$"):
+        World(3, ROBOT, PHYSICS, TileField(2))
+    field = TileField(1, crop=2.9)
     field.heights[5, 5] = HEIGHT_RANGE[1] + 0.01
     with pytest.raises(ValueError, match=r"^heights 0\.00\.\.2\.51 m leave \(-2\.5, 2\.5\) m$"):
         World(1, ROBOT, PHYSICS, field)
@@ -209,15 +207,15 @@ def resident() -> float:
 
 
 def test_redraws_leak_nothing() -> None:
-    field = TileField((1, 1), crop=2.5)
+    field = TileField(1, crop=2.5)
     world = World(1, ROBOT, PHYSICS, field)
     drawn = [make_tile(family, 1.0, np.random.default_rng(0)) for family in ALL_FAMILIES]
     for k in range(20):
-        field.place(0, 0, drawn[k % len(drawn)])
+        field.place(0, drawn[k % len(drawn)])
         world.upload_terrain()
     before = resident()
     for k in range(300):  # 20 kB each would show
-        field.place(0, 0, drawn[k % len(drawn)])
+        field.place(0, drawn[k % len(drawn)])
         world.upload_terrain()
     assert resident() - before < 6.0
     assert_rays_hit_the_field(world, 4)
@@ -423,7 +421,7 @@ def free_spot(field: TileField, row: int, rng: np.random.Generator) -> Array:
     angle, radius = np.meshgrid(np.linspace(0.0, 2 * math.pi, 24), np.linspace(0.0, 0.45, 10))
     around = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     while True:
-        spot = field.origin(row, 0) + rng.uniform([1.8, 2.5], [6.2, 5.5])
+        spot = field.origin(row) + rng.uniform([1.8, 2.5], [6.2, 5.5])
         points = spot + around
         above = field.height_at(points[..., 0], points[..., 1]).max()
         if above - field.support_at(spot[0], spot[1]) < 0.4:
@@ -446,11 +444,11 @@ def sinking(family: str, seed: int) -> tuple[int, int]:
         loco.act(rng.uniform(-limit, limit, (robots, 12)))
         x, y, z = np.moveaxis(world.state.foot_position, -1, 0)
         clearance = z - GEOMETRY.foot_radius - world.ground_height(x, y)
-        on = field.on_tile(index[:, None], 0, x, y)
+        on = field.on_tile(index[:, None], x, y)
         samples += int(on.sum())
         sunk += int(((clearance < -0.01) & on).sum())
         position = world.state.position
-        done = is_fallen(world) | ~field.on_tile(index, 0, position[:, 0], position[:, 1])
+        done = is_fallen(world) | ~field.on_tile(index, position[:, 0], position[:, 1])
     world.close()
     return samples, sunk
 
@@ -534,7 +532,7 @@ def trajectory(
     m, rng = world.num_robots, np.random.default_rng(seed)
     xy = np.column_stack([0.75 + 0.0 * np.arange(m), 0.5 * np.arange(m)])
     if world.field is not None:
-        xy = world.field.origin(np.arange(m), 0) + np.array([3.0, 4.0])
+        xy = world.field.origin(np.arange(m)) + np.array([3.0, 4.0])
     height = world.ground_height(xy[:, 0], xy[:, 1]).max() + STAND + 0.05
     put(world, xy, float(height), yaw=0.3)
     world.push(np.arange(m), np.tile([0.3, 0.1, 0.0], (m, 1)))
@@ -563,7 +561,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
     world = World(m, ROBOT, PHYSICS, field)
     xy = np.column_stack([np.arange(m), np.zeros(m)])
     if field is not None:
-        xy = field.origin(np.arange(m), 0) + np.array([3.0, 4.0])
+        xy = field.origin(np.arange(m)) + np.array([3.0, 4.0])
     ground = world.ground_height(xy[:, 0], xy[:, 1])
     pose, upright = np.tile(NOMINAL, (m, 1)), yaw_quaternion(rng.uniform(-3, 3, m))
     world.reset_robots(np.arange(m), np.column_stack([xy, ground + STAND + 0.1]), upright, pose)

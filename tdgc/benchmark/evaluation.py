@@ -260,11 +260,12 @@ class Batch:
     ) -> None:
         self.cell, self.seed = cell, seed
         condition, rows = CONDITIONS[cell.condition], np.arange(cell.count)
-        self.field = TileField((cell.count, 1))
-        for k in rows:
-            tile = tile_of(seed, cell.family, cell.level, cell.first + int(k), cell.condition)
-            self.field.place(int(k), 0, tile)
-        self.field.heights.setflags(write=False)  # the world is faster if they cannot change
+        self.field = TileField.of(
+            *(
+                tile_of(seed, cell.family, cell.level, cell.first + k, cell.condition)
+                for k in range(cell.count)
+            )
+        )
         self.told = cell.family if condition.told else "unknown"
         self.sensors = self.probes = None
         clock = np.zeros(cell.count)
@@ -277,13 +278,13 @@ class Batch:
         else:
             world, physics = make_world(self.field), config.physics
         loco = Locomotion(cell.count, config.robot, physics, self.field, config.gyro, world=world)
-        self.loco, self.origin = loco, self.field.origin(rows, 0)
+        self.loco, self.origin = loco, self.field.origin(rows)
         world, loco.delay[:] = loco.world, condition.latency
         world.friction[:] = physics.friction if condition.friction is None else condition.friction
         world.payload[:], world.armature[:] = condition.payload, condition.armature
         world.strength[:] = condition.motor
         world.apply_dynamics(rows)
-        start, self.goal = self.field.starts[:, 0], self.field.goals[:, 0] + self.origin
+        start, self.goal = self.field.starts, self.field.goals + self.origin
         loco.place(rows, start[:, :2] + self.origin, start[:, 2], clock)
         self._push_every = round(PUSH_INTERVAL / physics.control_dt)
         number = round(HORIZON / physics.control_dt) // self._push_every + 1
@@ -352,7 +353,7 @@ class EpisodeLog:
                 path_m=self._path[k],
                 energy_j=self._energy[k],
                 shares=tuple(self._shares[k] / self._steps[k]),
-                goal=self._batch.field.goals[k, 0],
+                goal=self._batch.field.goals[k],
                 track=np.array([*(pose[k] for pose in self._poses[: kept[k]]), last[k]]),
             )
             for k in range(cell.count)

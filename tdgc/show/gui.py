@@ -48,7 +48,7 @@ class _Window:
 
     def __init__(self, loco: Locomotion, field: TileField, stage: Stage) -> None:
         self._loco, self._stage, self._dt = loco, stage, loco.physics.control_dt
-        self._origin = np.append(field.origin(0, 0), 0.0)
+        self._origin = np.append(field.origin(0), 0.0)
         self._every = max(1, round(_TEXT_SECONDS / self._dt))
         self._due = time.perf_counter()
 
@@ -92,10 +92,10 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
     stage.add_slider(f"gait ({', '.join(GAITS)})", 0, len(GAITS) - 1, 0)
     stage.add_slider("back to the start", 1, 0, 0)
     window = _Window(loco, field, stage)
-    row, place = np.zeros(1, dtype=int), field.starts[0, 0]
+    row, place = np.zeros(1, dtype=int), field.starts[0]
 
     def begin() -> None:
-        loco.place(row, place[None, :2] + field.origin(row, 0), place[2:], np.zeros(1))
+        loco.place(row, place[None, :2] + field.origin(row), place[2:], np.zeros(1))
 
     begin()
     step, pressed = 0, 0.0

@@ -19,7 +19,7 @@ from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
 from tdgc.config.settings import NotNegative, Positive
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import GRAVITY, Array, RobotState, pd_torque, rotation_matrix
-from tdgc.sim.terrain import TileField
+from tdgc.sim.terrain import CELL, TileField
 from tdgc.sim.urdf import JOINTS, urdf_path
 from tdgc.sim.world import WindowError, World, check_display
 
@@ -224,7 +224,7 @@ def _add_ground(spec: mujoco.MjSpec, field: TileField) -> None:
     to 5 mm on rough ground. So the field is rotated by a quarter turn: its columns run along y, its
     rows against x.
     """
-    half_x, half_y = 0.5 * field.cell * (np.array(field.heights.shape) - 1)
+    half_x, half_y = 0.5 * CELL * (np.array(field.heights.shape) - 1)
     low, high = float(field.heights.min()), float(field.heights.max())
     spec.add_hfield(
         name=_NAME,

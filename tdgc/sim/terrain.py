@@ -101,8 +101,6 @@ SHORTEST_PART = 1.5  # m
 # Bullet keeps the height range of a field's first upload, so it is fixed to what any tile can need:
 # Tilt at level 12 reaches W/2 tan(0.54 rad) = 2.40 m up and down, all other families less.
 HEIGHT_RANGE = (-2.5, 2.5)  # m
-# btHeightfieldTerrainShape silently truncates larger fields.
-MAX_SAMPLES = 2_097_152
 
 # First entry of every tile's seed. It differs between the streams, so that no training tile is ever
 # an evaluation tile, whatever the seeds. Any two different values would do.
@@ -587,81 +585,76 @@ def tile_rng(
 
 
 class TileField:
-    """A (rows, cols) grid of tiles in one height field, with rows along x.
+    """A row of tiles along x in one height field.
 
-    Tiles share no samples, so they repeat every 8.05 m along x, and along y if not cropped. The
-    world frame has sample [0, 0] at (0, 0); a tile's frame is the world frame shifted by
-    ``origin``.
+    Tiles share no samples, so they repeat every 8.05 m. The world frame has sample [0, 0] at
+    (0, 0); a tile's frame is the world frame shifted by ``origin``.
 
     Attributes:
-        shape: (rows, cols).
+        count: number of tiles.
         crop: m, cut off each tile on both sides in y. Training uses a narrower field because
             Bullet's 600 bytes per sample dominate memory use.
-        heights, support: (161 rows, n cols) m, see ``Tile``; n is 161 less the cropped samples.
+        heights, support: (161 count, n) m, see ``Tile``; n is 161 less the cropped samples.
             ``place`` overwrites them in place.
-        starts, goals: (rows, cols, 3) and (rows, cols, 2), start (x, y, yaw) and goal (x, y) of
-            each tile, in its frame.
-        features: (row, col) -> ``Features`` of that tile, in its frame; empty until one is placed.
+        starts, goals: (count, 3) and (count, 2), start (x, y, yaw) and goal (x, y) of each tile, in
+            its frame.
+        features: of each tile, in its frame; empty until one is placed.
 
     Raises:
         ValueError: a crop that leaves no room for starts and goals.
     """
 
-    def __init__(self, shape: tuple[int, int], crop: float = 0.0) -> None:
+    def __init__(self, count: int, crop: float = 0.0) -> None:
         if not 0.0 <= crop < TILE_SIZE / 2 - Y_SPREAD:
             raise ValueError(f"crop must lie in [0, {TILE_SIZE / 2 - Y_SPREAD}) m, got {crop}")
-        self.shape = shape
-        self.cell = CELL
-        self._cut = round(crop / CELL)
-        self._width = TILE_SAMPLES - 2 * self._cut
+        self.count, self._cut = count, round(crop / CELL)
         self.crop = self._cut * CELL
-        rows, cols = shape
-        self.heights: HeightArray = np.zeros((rows * TILE_SAMPLES, cols * self._width), np.float32)
+        self.heights: HeightArray = np.zeros(
+            (count * TILE_SAMPLES, TILE_SAMPLES - 2 * self._cut), np.float32
+        )
         self.support: HeightArray = np.zeros_like(self.heights)
-        self.starts, self.goals = np.zeros((rows, cols, 3)), np.zeros((rows, cols, 2))
-        self.features = {tile: Features() for tile in np.ndindex(rows, cols)}
+        self.starts, self.goals = np.zeros((count, 3)), np.zeros((count, 2))
+        self.features = [Features()] * count
 
     @classmethod
-    def of(cls, tile: Tile) -> "TileField":
-        """A field of one tile; its heights are read-only, which makes worlds faster."""
-        field = cls((1, 1))
-        field.place(0, 0, tile)
+    def of(cls, *tiles: Tile) -> "TileField":
+        """A field of these tiles; its heights are read-only, which makes worlds faster."""
+        field = cls(len(tiles))
+        for k, tile in enumerate(tiles):
+            field.place(k, tile)
         field.heights.setflags(write=False)
         return field
 
-    def place(self, row: int, col: int, tile: Tile) -> None:
-        """Copy a tile into the field, in place."""
-        n, m, cut = TILE_SAMPLES, self._width, self._cut
-        where = np.s_[row * n : (row + 1) * n, col * m : (col + 1) * m]
-        self.heights[where] = tile.heights[:, cut : cut + m]
-        self.support[where] = tile.support[:, cut : cut + m]
-        self.starts[row, col], self.goals[row, col] = tile.start, tile.goal
-        self.features[row, col] = tile.features
+    def place(self, k: int, tile: Tile) -> None:
+        """Copy a tile to place ``k`` of the field."""
+        rows = slice(k * TILE_SAMPLES, (k + 1) * TILE_SAMPLES)
+        columns = slice(self._cut, TILE_SAMPLES - self._cut)
+        self.heights[rows] = tile.heights[:, columns]
+        self.support[rows] = tile.support[:, columns]
+        self.starts[k], self.goals[k] = tile.start, tile.goal
+        self.features[k] = tile.features
 
-    def origin(self, row: ArrayLike, col: ArrayLike) -> FloatArray:
-        """World xy (..., 2) in m of the origins of the frames of the tiles at (row, col)."""
-        index = np.stack(np.broadcast_arrays(row, col), axis=-1)
-        pitch = np.array([TILE_SAMPLES, self._width]) * self.cell
-        return index * pitch - np.array([0.0, self.crop])
+    def origin(self, k: ArrayLike) -> FloatArray:
+        """World xy (..., 2) in m of the origins of the frames of the tiles ``k`` (...)."""
+        x = TILE_SAMPLES * CELL * np.asarray(k)
+        return np.stack([x, np.full_like(x, -self.crop)], axis=-1)
 
-    def on_tile(
-        self, row: ArrayLike, col: ArrayLike, x: ArrayLike, y: ArrayLike
-    ) -> NDArray[np.bool_]:
-        """Whether world points lie on the tiles at (row, col), without the crop; all broadcast."""
-        local = np.stack(np.broadcast_arrays(x, y), axis=-1) - self.origin(row, col)
+    def on_tile(self, k: ArrayLike, x: ArrayLike, y: ArrayLike) -> NDArray[np.bool_]:
+        """Whether world points lie on the tiles ``k``, without the crop; all broadcast."""
+        local = np.stack(np.broadcast_arrays(x, y), axis=-1) - self.origin(k)
         low = np.array([0.0, self.crop])
         return np.asarray(((local >= low) & (local <= TILE_SIZE - low)).all(axis=-1))
 
     def height_at(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Height in m of the collision surface at world points, clamped to the field's border."""
-        return interpolate(self.heights, self.cell, x, y)
+        return interpolate(self.heights, x, y)
 
     def support_at(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """As ``height_at``, for the support surface of the fall rule."""
-        return interpolate(self.support, self.cell, x, y)
+        return interpolate(self.support, x, y)
 
 
-def interpolate(surface: HeightArray, cell: float, x: ArrayLike, y: ArrayLike) -> FloatArray:
+def interpolate(surface: HeightArray, x: ArrayLike, y: ArrayLike) -> FloatArray:
     """Height in m at points (x, y) of any shape, exactly as on Bullet's triangles.
 
     Bullet splits each cell along the diagonal from [ix + 1, iy] to [ix, iy + 1] (its default,
@@ -671,8 +664,8 @@ def interpolate(surface: HeightArray, cell: float, x: ArrayLike, y: ArrayLike) -
     """
     nx, ny = surface.shape
     flat = surface.reshape(-1)
-    u = np.clip(np.asarray(x) / cell, 0.0, nx - 1)
-    v = np.clip(np.asarray(y) / cell, 0.0, ny - 1)
+    u = np.clip(np.asarray(x) / CELL, 0.0, nx - 1)
+    v = np.clip(np.asarray(y) / CELL, 0.0, ny - 1)
     ix = np.minimum(np.nan_to_num(u).astype(np.intp), nx - 2)  # NaN where the simulation diverged
     iy = np.minimum(np.nan_to_num(v).astype(np.intp), ny - 2)
     u, v = u - ix, v - iy

@@ -31,7 +31,7 @@ from tdgc.sim.robot import (
     rotation_matrix,
 )
 from tdgc.sim.rotors import excess_momentum
-from tdgc.sim.terrain import HEIGHT_RANGE, MAX_SAMPLES, TILE_SAMPLES, TileField
+from tdgc.sim.terrain import CELL, HEIGHT_RANGE, TILE_SAMPLES, TileField
 from tdgc.sim.urdf import JOINTS, merged_file, read_urdf, urdf_path
 
 _GROUND, _ROBOT = 1, 2  # collision groups: robots collide with the ground only
@@ -117,8 +117,8 @@ class World:
         visual: bool = False,
         window: bool = False,
     ) -> None:
-        if field is not None and field.shape[0] != num_robots:
-            raise ValueError(f"{num_robots} robots need as many tile rows, not {field.shape[0]}")
+        if field is not None and field.count != num_robots:
+            raise ValueError(f"{num_robots} robots need as many tiles, not {field.count}")
         self.num_robots = num_robots
         self.robot = robot
         self.physics = physics
@@ -193,10 +193,9 @@ class World:
             else:
                 client.shape = self._upload(client, heights, -1)
             nx, ny = heights.shape
-            cell = self.field.cell
             centre = [
-                (client.samples.start + 0.5 * (nx - 1)) * cell,
-                0.5 * (ny - 1) * cell,
+                (client.samples.start + 0.5 * (nx - 1)) * CELL,
+                0.5 * (ny - 1) * CELL,
                 0.5 * (low + high),
             ]
             # Without another visual shape, Bullet keeps 360 bytes per sample to draw the field.
@@ -208,17 +207,14 @@ class World:
         client.setCollisionFilterGroupMask(client.ground, -1, _GROUND, _ROBOT)
 
     def _upload(self, client: _Client, heights: NDArray[np.float32], replace: int) -> int:
-        """Send heights to Bullet after checking their number and range, which Bullet does not."""
-        assert self.field is not None
-        if heights.size > MAX_SAMPLES:
-            raise ValueError(f"Bullet holds {MAX_SAMPLES} samples a field, not {heights.size}")
+        """Send heights to Bullet after checking their range, which Bullet does not."""
         low, high = float(heights.min()), float(heights.max())
         if low < HEIGHT_RANGE[0] or high > HEIGHT_RANGE[1]:
             raise ValueError(f"heights {low:.2f}..{high:.2f} m leave {HEIGHT_RANGE} m")
         return int(
             client.createCollisionShape(
                 pybullet.GEOM_HEIGHTFIELD,
-                meshScale=[self.field.cell, self.field.cell, 1.0],
+                meshScale=[CELL, CELL, 1.0],
                 heightfieldData=heights.T.ravel(),  # Bullet's rows run along x
                 numHeightfieldRows=heights.shape[0],
                 numHeightfieldColumns=heights.shape[1],

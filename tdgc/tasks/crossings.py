@@ -86,7 +86,7 @@ class Crossings:
     def plan(self, field: TileField, index: NDArray[np.integer]) -> None:
         """Plan the leaps of the robots ``index`` (n,) with the ``spread`` stored by ``look``."""
         for i in index[self.leapers[index]]:
-            trenches = field.features[int(i), 0].trenches
+            trenches = field.features[int(i)].trenches
             self._plan.look(int(i), trenches, float(self.spread[i]))
 
     # ------------------------------------------------------------------ what is drawn

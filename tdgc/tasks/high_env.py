@@ -90,7 +90,7 @@ class NavigationTask:
         self.tiles = TrainingTiles(families, seed, alter)
         self.field = self.tiles.field
         self._build_robots()
-        self._origin = self.field.origin(np.arange(m), 0)
+        self._origin = self.field.origin(np.arange(m))
         self.goal = np.zeros((m, 2))
         self.elapsed = np.zeros(m, dtype=np.int64)
         self._reached_at = np.full(m, -1)

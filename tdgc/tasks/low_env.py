@@ -136,7 +136,7 @@ class LowLevelTask:
         if changed.size:
             self.locomotion.world.upload_terrain(changed)
             self.crossings.look(self.tiles.field, changed)
-        origin = self.tiles.field.origin(index, np.zeros_like(index))
+        origin = self.tiles.field.origin(index)
         start, goal = draw_start_goal(rng, (n,))
         # Free commands lead anywhere, so robots on flat tiles start in the middle.
         start[self.crossings.flat[index], :2] = 0.5 * TILE_SIZE

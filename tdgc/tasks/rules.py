@@ -47,7 +47,7 @@ def outcome(
     if goal is not None:
         ended[np.hypot(*(world.state.position[:, :2] - goal).T) < GOAL_RADIUS] = REACHED
     if world.field is not None:
-        ended[~world.field.on_tile(np.arange(len(x)), 0, x, y)] = LEFT_TILE
+        ended[~world.field.on_tile(np.arange(len(x)), x, y)] = LEFT_TILE
     ended[world.state.trunk_force > TRUNK_FORCE] = COLLIDED
     # So written that a robot whose simulation has blown up, at NaN, has fallen as well.
     ended[~(world.trunk_height() >= FALL_HEIGHT)] = FELL

@@ -167,9 +167,9 @@ class Teacher:
     """
 
     def __init__(self, field: TileField, ranges: CommandRanges, skill: Skill) -> None:
-        m = field.shape[0]
+        m = field.count
         self._field, self._ranges, self._landing = field, ranges, skill.landing
-        self._origin = field.origin(np.arange(m), 0)
+        self._origin = field.origin(np.arange(m))
         commands = np.array([style.command() for style in (skill.uneven, SLOPING, LEAPING)])
         # The low policy may have been trained on narrower ranges than the styles use.
         self._uneven, self._sloping, self._leap = CommandDecoder(ranges).nearest(commands)

@@ -96,7 +96,7 @@ class TrainingTiles:
     ) -> None:
         m = len(families)
         self.families, self._seed, self._alter = tuple(families), seed, alter
-        self.field = TileField((m, 1), crop=TILE_CROP)
+        self.field = TileField(m, crop=TILE_CROP)
         self._relief = np.array([family != FLAT for family in families])
         self.level = np.full(m, -1)  # none yet
         self.number = np.zeros(m, dtype=np.int64)
@@ -127,7 +127,7 @@ class TrainingTiles:
             family, level = self.families[i], int(self.level[i])
             rng = tile_rng(self._seed, family, level, int(self.number[i]), TRAIN_STREAM)
             tile = make_tile(family, level / MAX_LEVEL, rng)
-            self.field.place(int(i), 0, self._alter(tile, level) if self._alter else tile)
+            self.field.place(int(i), self._alter(tile, level) if self._alter else tile)
         return index[(self._heights()[index] != before).any(axis=(1, 2))]
 
     def _heights(self) -> NDArray[np.float32]:
