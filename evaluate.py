@@ -42,7 +42,7 @@ from tdgc.sim.geometry import read_geometry
 from tdgc.sim.world import WindowError
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.manners import find_manner, manner_of
-from tdgc.tasks.pairing import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of
 from tdgc.tasks.teacher import Skill
 
 POLICIES = ("tdgc", "gp")
@@ -315,7 +315,7 @@ def run_one(
         return Ran(episodes, recorder.recordings(), [], [])
     tracer = Tracer(driver)
     episodes = run_cell(cell, low, driver, seed, [tracer, recorder])
-    traces, hips = tracer.traces(), float(read_geometry(load_low(low)[1].robot).hips[0, 0])
+    traces, hips = tracer.traces(), float(read_geometry(mdp_of(low).robot).hips[0, 0])
     return Ran(
         episodes,
         recorder.recordings(),

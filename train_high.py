@@ -54,7 +54,7 @@ from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
 from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.manners import find_manner, manner_of, may_leap, within
-from tdgc.tasks.pairing import PRETRAINED, load_low, paired
+from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of, paired
 from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.teacher import Skill
 from tdgc.tasks.tiles import check_families, check_levels, left_out
@@ -124,7 +124,7 @@ def with_manner(config: HighTrainConfig, low: Policy, init: Path | None) -> High
         manner = find_manner(low, config.env, tqdm.write)
     if manner is None:
         return config
-    ranges = paired(config.env, load_low(low)[1]).commands
+    ranges = paired(config.env, mdp_of(low)).commands
     assert ranges is not None  # ``paired`` has set them
     limited = within(manner, ranges)
     for change in differences(to_dict(limited), to_dict(manner), "imitation.teacher"):
@@ -172,7 +172,7 @@ def make_env(
         landing, manner = None, config.imitation.teacher
         assert manner is not None  # ``with_manner`` has set it
         if may_leap(env_config):
-            landing = measure_landing(*load_low(low), manner.leap_speed)
+            landing = measure_landing(low, mdp_of(low), manner.leap_speed)
             if landing is None:
                 tqdm.write("the low policy falls when it leaps: the teacher walks over trenches")
         skill = Skill(landing, manner)

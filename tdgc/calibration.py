@@ -35,7 +35,7 @@ from tdgc.policies import Correction, Policy
 from tdgc.sim.commands import NAMES, NUM_COMMANDS, SIDEWAYS, command_bounds
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.robot import Array
-from tdgc.tasks.pairing import load_low
+from tdgc.tasks.pairing import load_low, mdp_of
 from tdgc.tasks.rules import is_fallen
 
 #: Fewer robots whose walking is measured say nothing about the commands.
@@ -66,7 +66,7 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     Velocities are in the heading frame. Robots that fell are left out, so n may be smaller; it is 0
     if the simulation of one diverged, which spoils those of the others.
     """
-    config = load_low(low)[1]
+    config = mdp_of(low)
     rng = np.random.default_rng((_STREAM, seed))
     command = draw_commands(rng, config.commands, np.arange(robots) % len(GAITS))
     middle = command_bounds(config.commands)[:3].mean(axis=1)
@@ -218,7 +218,7 @@ def calibrate(
         ConfigError: fewer than ``_LEAST_WALKED`` robots walked without a fall.
         WorkerError: a worker failed.
     """
-    config = load_low(low)[1]
+    config = mdp_of(low)
     robots = calibration.robots
     counts = [min(_BATCH, robots - first) for first in range(0, robots, _BATCH)]
     jobs = [

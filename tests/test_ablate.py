@@ -62,7 +62,7 @@ def test_discounts_are_per_second() -> None:
 
 
 def test_the_feed_forward_variant_has_as_many_parameters() -> None:
-    task = NavigationTask(HighLevelConfig(families=("rough",)), LOW, 1, seed=0)
+    task = NavigationTask(HighLevelConfig(families=("rough",)), policies.load(LOW), 1, seed=0)
     counts = []
     for variant in (named(WHOLE), named("feed-forward")):
         ppo = with_overrides(HighTrainConfig(), variant.settings or ()).ppo

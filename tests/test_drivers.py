@@ -40,9 +40,8 @@ from tdgc.tasks.probes import PROBES, height_probes
 from tdgc.tasks.teacher import Skill, toward
 
 LOW = PRETRAINED / "low"
-CONFIG = HighLevelConfig(
-    commands=load_low(LOW)[1].commands, randomisation=RandomisationConfig(scale=0.0)
-)
+LOW_POLICY, LOW_CONFIG = load_low(LOW)
+CONFIG = HighLevelConfig(commands=LOW_CONFIG.commands, randomisation=RandomisationConfig(scale=0.0))
 
 
 def save_high(
@@ -150,7 +149,7 @@ def test_the_teacher_drives_as_it_teaches(low, family):
     """Its commands are those that the student is shown, held for a decision."""
     config = dataclasses.replace(CONFIG, families=(family,))
     skill = Skill(Landing(-0.02, 0.08))
-    task = NavigationTask(config, LOW, 2, seed=4, training=False, taught=skill)
+    task = NavigationTask(config, LOW_POLICY, 2, seed=4, training=False, taught=skill)
     try:
         task.reset(np.arange(2))
         executor, driver = Executor(task.locomotion, low[0]), TeacherDriver(low[1], skill)
@@ -173,7 +172,7 @@ def test_the_teacher_drives_as_it_teaches(low, family):
 def test_scripts_leap_at_the_speed_that_suits_the_low_policy(low, script):
     skill = Skill(Landing(), TeacherConfig(leap_speed=0.9))
     task = NavigationTask(
-        dataclasses.replace(CONFIG, families=("gap",)), LOW, 2, seed=4, training=False
+        dataclasses.replace(CONFIG, families=("gap",)), LOW_POLICY, 2, seed=4, training=False
     )
     try:
         task.reset(np.arange(2))
@@ -197,7 +196,7 @@ def test_hierarchy_decides_in_the_evaluation_as_in_its_environment(low, tmp_path
     config = dataclasses.replace(CONFIG, families=("gap",), gaits=gaits)
     high, loaded = load_high(save_high(tmp_path / "high", low, config, hidden=hidden), *low)
     assert loaded == config and high.kind == ("mlp" if hidden is None else "lstm")
-    task = NavigationTask(config, LOW, 2, seed=1, training=False)
+    task = NavigationTask(config, LOW_POLICY, 2, seed=1, training=False)
     try:
         task.reset(np.arange(2))
         driver = HierarchyDriver(high, loaded)

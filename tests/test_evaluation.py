@@ -59,7 +59,7 @@ from tdgc.sim.terrain import EDITION
 from tdgc.sim.world import World
 from tdgc.tasks import manners
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.pairing import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of
 from tdgc.tasks.rules import OUTCOMES
 
 
@@ -140,7 +140,7 @@ def test_conditions_are_the_benchmarks():
 
 
 def test_physics_at_1000_hz_keeps_the_control_rate(low):
-    config = load_low(low)[1]
+    config = mdp_of(low)
     fast = physics_of(config, CONDITIONS["physics-1000hz"])
     assert fast.substeps == 20 and fast.dt == pytest.approx(0.001)
     assert physics_of(config, CONDITIONS["nominal"]) == PhysicsConfig()
@@ -281,7 +281,7 @@ class Recorder(HierarchyDriver):
 
 def test_shares_are_of_the_gaits_commanded(low, high, monkeypatch):
     monkeypatch.setattr(evaluation, "HORIZON", 1.0)
-    driver = Recorder(*load_high(high, low, load_low(low)[1]))
+    driver = Recorder(*load_high(high, low, mdp_of(low)))
     episodes = run_cell(Cell("tdgc", "nominal", "rough", 0, 0, 2), low, driver, seed=0)
     assert np.count_nonzero(episodes[0].shares) > 1
     for k, episode in enumerate(episodes):
@@ -338,7 +338,7 @@ def test_the_table_does_not_depend_on_the_processes(table, low, high, tmp_path):
         assert (tmp_path / name).read_bytes() == (table / name).read_bytes()
     with np.load(table / "trajectories.npz") as one, np.load(tmp_path / "trajectories.npz") as two:
         assert all(np.array_equal(one[key], two[key]) for key in ("poses", "counts", "goals"))
-    driver = HierarchyDriver(*load_high(high, low, load_low(low)[1]))
+    driver = HierarchyDriver(*load_high(high, low, mdp_of(low)))
     here = run_cell(Cell("tdgc", "nominal", "gap", 10, 0, 2), low, driver, seed=3)
     assert [{k: str(v) for k, v in e.row().items()} for e in here] == rows_of(table)[:2]
 
@@ -460,7 +460,7 @@ def test_the_teacher_leads_on_any_terrain(tmp_path):
 @pytest.mark.usefixtures("quick_landing")
 def test_the_scripts_command_as_the_teacher_of_the_high_policy_did(low, tmp_path, capsys):
     """A high policy of another robot had a teacher that walked, stepped and leapt differently."""
-    config, high = load_low(low)[1], tmp_path / "high"
+    config, high = mdp_of(low), tmp_path / "high"
     header = json.loads((PRETRAINED / "high.json").read_text(encoding="utf-8"))
     flags = ["--policies", "teacher", "--families", "stair", "--workers", "1", "--high", str(high)]
     shutil.copy(PRETRAINED / "high.safetensors", tmp_path)
@@ -487,7 +487,7 @@ def test_without_a_high_policy_the_scripts_try_out_what_suits_the_low_policy(
 
     monkeypatch.setattr(manners, "arrivals", arrives)
     asked = evaluate.Evaluation.of(evaluate.parse(["--policies", "teacher"]))
-    skill = dataclasses.replace(asked, high=None).skill(low, load_low(low)[1])
+    skill = dataclasses.replace(asked, high=None).skill(low, mdp_of(low))
     assert skill.manner == TeacherConfig(0.9, 3.3, 1.0)
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "there is no high policy: trying out how the low policy walks and leaps best"
@@ -506,7 +506,7 @@ def test_the_window_shows_the_tuned_policy(monkeypatch):
 
 def test_the_baseline_keeps_to_what_the_low_policy_was_trained_on(low):
     narrow = dataclasses.replace(CommandRanges(), vx=(-0.3, 0.3))
-    config = dataclasses.replace(load_low(low)[1], commands=narrow)
+    config = dataclasses.replace(mdp_of(low), commands=narrow)
     asked = evaluate.Evaluation.of(evaluate.parse(["--policies", "gp", "--workers", "1"]))
     assert asked.drivers(low, config)["gp"].bounds == narrow
 
@@ -521,7 +521,7 @@ def test_the_robot_is_read_for_diagnoses_alone(low, monkeypatch):
     plain = evaluate.run_one(cell, low, drivers, 5, 0, None)
     assert (robots, plain.diagnoses, plain.traces) == ([], [], [])
     traced = evaluate.run_one(cell, low, drivers, 5, 0, Selection.parse("failed"))
-    assert robots == [load_low(low)[1].robot]
+    assert robots == [mdp_of(low).robot]
     assert (
         [d.outcome for d in traced.diagnoses] == [t.outcome for t in traced.traces] == ["timeout"]
     )
@@ -626,7 +626,7 @@ def test_a_tracking_that_is_stopped_is_one_line(tmp_path, monkeypatch, capsys):
 
 def test_a_training_may_rewrite_the_policy_meanwhile(low, tmp_path, monkeypatch):
     monkeypatch.setattr(evaluation, "HORIZON", 0.04)
-    high = save_high(tmp_path / "high", (low, load_low(low)[1]), meta={"benchmark": 2})
+    high = save_high(tmp_path / "high", (low, mdp_of(low)), meta={"benchmark": 2})
 
     def run_jobs(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:
         high.with_suffix(".json").write_text("{", encoding="utf-8")

@@ -235,7 +235,7 @@ def test_high_level_is_the_tasks_observation_and_decoder(
     policy = policies.load(random_high(tmp_path / "high", config, encoder=encoder))
     assert policy.state_size == (64 if probes == "lines" else 32)
     graph = HighGraph(policy, config, LOW_CONFIG)
-    task = NavigationTask(config, LOW, 5, seed=2, training=False)
+    task = NavigationTask(config, LOW_POLICY, 5, seed=2, training=False)
     loco, rng = task.locomotion, np.random.default_rng(1)
     try:
         task.reset(np.arange(5))

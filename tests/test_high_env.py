@@ -46,14 +46,15 @@ from tdgc.tasks.rules import FELL, REACHED
 from tdgc.tasks.teacher import WAY, Skill
 
 LOW = PRETRAINED / "low"
+LOW_POLICY, LOW_CONFIG = load_low(LOW)
 POINTS = PROBES[HighLevelConfig().probes]
 NOMINAL = nominal_pose(RobotConfig())
-CONFIG = HighLevelConfig(commands=load_low(LOW)[1].commands)
+CONFIG = HighLevelConfig(commands=LOW_CONFIG.commands)
 
 
 @pytest.fixture
 def task():
-    task = NavigationTask(CONFIG, LOW, 5, seed=3, training=False)
+    task = NavigationTask(CONFIG, LOW_POLICY, 5, seed=3, training=False)
     task.reset(np.arange(5))
     yield task
     task.close()
@@ -157,7 +158,7 @@ def test_sees_how_fast_the_goal_comes_nearer(task):
 def test_mirrored_robots_see_mirrored_things(cues):
     """A robot's mirror image on the mirrored tile, one of Pillar, has the mirrored observation."""
     config = dataclasses.replace(CONFIG, cues=cues, families=("pillar",), unknown_share=0.0)
-    task = NavigationTask(config, LOW, 2, seed=0, training=False)
+    task = NavigationTask(config, LOW_POLICY, 2, seed=0, training=False)
     loco, state, rng = task.locomotion, task.locomotion.world.state, np.random.default_rng(0)
     tile = make_tile("pillar", 1.0, rng)
     image = dataclasses.replace(tile, heights=tile.heights[:, ::-1], support=tile.support[:, ::-1])
@@ -198,7 +199,7 @@ def test_a_symmetric_policy_needs_the_same_bounds_to_both_sides():
 
 def test_the_teachers_episodes_move_no_levels():
     config = dataclasses.replace(CONFIG, window=2, threshold=2, first_levels=3)
-    task = NavigationTask(config, LOW, 10, seed=0, taught=Skill(), led=75)
+    task = NavigationTask(config, LOW_POLICY, 10, seed=0, taught=Skill(), led=75)
     task.reset(np.arange(10))
     task.curriculum.push(np.arange(10), np.zeros(10, dtype=bool))
     task._led[:] = np.arange(10) < 5
@@ -217,7 +218,7 @@ def test_some_episodes_in_training_are_not_told_their_family():
     where = columns(high_layout(CONFIG))["family"]
     names = np.tile([SEMANTIC.index("tilt"), SEMANTIC.index("rough")], 10)
     for training in (True, False):
-        task = NavigationTask(config, LOW, 20, seed=0, training=training)
+        task = NavigationTask(config, LOW_POLICY, 20, seed=0, training=training)
         unknown = np.zeros((20, 20), dtype=bool)
         for episode in unknown:
             task.reset(np.arange(20))
@@ -268,7 +269,7 @@ def test_probes_see_what_is_ahead(task):
 @pytest.mark.parametrize("training", [True, False])
 def test_sensors_are_noisy_in_training_only(training):
     """Noise is added to the low policy's observation and to the probes, in training only."""
-    task = NavigationTask(CONFIG, LOW, 5, seed=3, training=training)
+    task = NavigationTask(CONFIG, LOW_POLICY, 5, seed=3, training=training)
     exact = Locomotion(
         5, task.low_config.robot, task.low_config.physics, task.field, task.low_config.gyro
     )
@@ -318,7 +319,7 @@ def test_curriculum_moves_levels_and_redraws_tiles():
     config = dataclasses.replace(
         CONFIG, families=("stair",), window=2, threshold=2, episode_seconds=0.2
     )
-    task = NavigationTask(config, LOW, 2, seed=0)
+    task = NavigationTask(config, LOW_POLICY, 2, seed=0)
     try:
         task.reset(np.arange(2))
         for _ in range(2):  # two episodes of two decisions; only robot 0 reaches its goal
@@ -341,7 +342,7 @@ def test_levels_without_performance(rule):
     config = dataclasses.replace(
         CONFIG, families=("tilt",), curriculum=rule, levels=4, window=2, threshold=2
     )
-    task = NavigationTask(config, LOW, 30, seed=0)
+    task = NavigationTask(config, LOW_POLICY, 30, seed=0)
     try:
         met = []
         for _ in range(6):
@@ -365,14 +366,14 @@ def test_trenches_are_shallow_in_training_alone_and_where_it_is_asked_for():
     depths = []
     for asked, training in ((0.05, True), (0.05, False), (None, True)):
         config = dataclasses.replace(CONFIG, families=("gap",), shallowest_trench=asked)
-        task = NavigationTask(config, LOW, 1, seed=0, training=training)
+        task = NavigationTask(config, LOW_POLICY, 1, seed=0, training=training)
         depths.append(-task.field.heights.min())
         task.close()
     assert depths == pytest.approx([0.05, 0.6, 0.6], abs=1e-6)
 
 
 def test_velocities_alone_leave_the_other_commands_at_their_defaults():
-    _, low = load_low(LOW)
+    low = LOW_CONFIG
     config = paired(HighLevelConfig(behaviour="velocities"), low)
     decoder = CommandDecoder(config.commands)
     rng, default = np.random.default_rng(0), default_command()
@@ -389,7 +390,7 @@ def test_velocities_alone_leave_the_other_commands_at_their_defaults():
 def test_a_teacher_says_what_can_be_said_of_what_it_does():
     """A student limited to trot at fixed parameters is still shown the velocities of a leap."""
     config = dataclasses.replace(CONFIG, families=("gap",), gaits=("trot",), behaviour="velocities")
-    task = NavigationTask(config, LOW, 2, seed=0, taught=Skill(Landing()), led=6)
+    task = NavigationTask(config, LOW_POLICY, 2, seed=0, taught=Skill(Landing()), led=6)
     try:
         task.reset(np.arange(2))
         size = width(high_layout(CONFIG))
@@ -404,11 +405,11 @@ def test_a_teacher_says_what_can_be_said_of_what_it_does():
 
 def test_robots_begin_spread_over_the_first_levels():
     config = dataclasses.replace(CONFIG, families=("stair", "gap"), first_levels=3)
-    task = NavigationTask(config, LOW, 8, seed=0)
+    task = NavigationTask(config, LOW_POLICY, 8, seed=0)
     assert task.curriculum.levels.tolist() == [0, 0, 1, 1, 2, 2, 0, 0]
     task.close()
     config = dataclasses.replace(config, first_level=7, first_levels=2)
-    task = NavigationTask(config, LOW, 8, seed=0)
+    task = NavigationTask(config, LOW_POLICY, 8, seed=0)
     levels = [7, 7, 8, 8, 7, 7, 8, 8]
     assert task.curriculum.levels.tolist() == levels
     task.curriculum.push(np.arange(8), np.zeros(8, dtype=bool))
@@ -422,7 +423,7 @@ def test_robots_begin_spread_over_the_first_levels():
 def test_a_teacher_shows_the_second_way_around_pillars():
     """The guidance holds the difference of the second way from the first, in actions."""
     task = NavigationTask(
-        dataclasses.replace(CONFIG, families=("pillar",)), LOW, 40, 0, taught=Skill()
+        dataclasses.replace(CONFIG, families=("pillar",)), LOW_POLICY, 40, 0, taught=Skill()
     )
     try:
         task.curriculum.levels[:] = 9
@@ -450,7 +451,7 @@ def test_a_teacher_shows_the_second_way_around_pillars():
 
 def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
     config = dataclasses.replace(CONFIG, families=("stair", "gap"), episode_seconds=0.2)
-    task = NavigationTask(config, LOW, 40, seed=0, taught=Skill(), led=6)
+    task = NavigationTask(config, LOW_POLICY, 40, seed=0, taught=Skill(), led=6)
     try:
         task.reset(np.arange(40))
         size = width(high_layout(CONFIG))
@@ -481,8 +482,8 @@ def test_the_future_follows_from_the_state(episodes, taught):
     during the test. Without, it begins new ones, as the other does after ``restart``.
     """
     config = dataclasses.replace(CONFIG, families=("rough", "gap"), episode_seconds=0.8)
-    first = NavigationTask(config, LOW, 3, seed=1, taught=taught, led=15)
-    second = NavigationTask(config, LOW, 3, seed=1, taught=taught, led=15)
+    first = NavigationTask(config, LOW_POLICY, 3, seed=1, taught=taught, led=15)
+    second = NavigationTask(config, LOW_POLICY, 3, seed=1, taught=taught, led=15)
     try:
         first.reset(np.arange(3))
         rng = np.random.default_rng(0)
@@ -529,7 +530,7 @@ def test_a_robot_that_blows_up_in_a_decision_is_seen_in_the_observation(task):
 
 
 def test_bounds_outside_the_low_levels_training_are_refused():
-    _, low = load_low(LOW)
+    low = LOW_CONFIG
     wide = HighLevelConfig(commands=dataclasses.replace(CONFIG.commands, vx=(-1.0, 1.5)))
     with pytest.raises(ConfigError, match=r"commands.vx asks for \[-1.0, 1.5\].*\[-1.0, 1.2\]"):
         paired(wide, low)
@@ -545,7 +546,7 @@ def test_nan_action_is_refused(task):
 def test_a_robot_that_blew_up_gets_no_guidance():
     """The worker ends its episode, and those of the others; the teacher cannot command it."""
     config = dataclasses.replace(CONFIG, families=("clutter", "gap"))
-    task = NavigationTask(config, LOW, 2, seed=0, taught=Skill(Landing()))
+    task = NavigationTask(config, LOW_POLICY, 2, seed=0, taught=Skill(Landing()))
     task.reset(np.arange(2))
     assert task.observe()[:, -GUIDANCE:].any()
     task.locomotion.world.state.position[0] = np.nan
@@ -560,7 +561,7 @@ def test_a_robot_that_blew_up_gets_no_guidance():
 def test_without_the_semantic_cue_no_robot_is_told(cues, untold):
     """So the teacher leaps only where trenches can be seen."""
     config = dataclasses.replace(CONFIG, families=("gap",), cues=cues, unknown_share=0.0)
-    task = NavigationTask(config, LOW, 2, seed=0, taught=Skill(Landing()))
+    task = NavigationTask(config, LOW_POLICY, 2, seed=0, taught=Skill(Landing()))
     task.reset(np.arange(2))
     gaits = gait_index(task.teacher.commands(task.locomotion, task.goal))
     task.close()
@@ -570,7 +571,7 @@ def test_without_the_semantic_cue_no_robot_is_told(cues, untold):
 def test_families_are_dealt_to_the_robots_of_the_run():
     """Whichever worker they are in: a worker of 3 robots after 14 others; and by an env's seed."""
     config = dataclasses.replace(CONFIG, families=("rough", "stair", "gap", "tilt"), first_levels=3)
-    task = NavigationTask(config, LOW, 3, seed=0, first=14)
+    task = NavigationTask(config, LOW_POLICY, 3, seed=0, first=14)
     assert task.tiles.families == ("gap", "tilt", "rough")
     assert task.curriculum.levels.tolist() == [0, 0, 1]  # the 14th robot is the fourth in Gap
     task.close()
@@ -612,7 +613,7 @@ def test_gymnasium_and_sb3_accept_it():
 
 def test_an_episode_begins_with_the_default_command() -> None:
     """As in the evaluation: the first observation shows nothing of the episode before."""
-    task = NavigationTask(HighLevelConfig(families=("gap",)), PRETRAINED / "low", 2, seed=0)
+    task = NavigationTask(HighLevelConfig(families=("gap",)), LOW_POLICY, 2, seed=0)
     try:
         task.reset(np.arange(2))
         assert (task.locomotion.command == default_command()).all()
@@ -641,7 +642,7 @@ def steps(monkeypatch):
 
 
 def test_the_reward_of_a_decision_is_the_sum_of_its_terms(steps):
-    task = NavigationTask(CONFIG, LOW, 2, seed=3, training=False)
+    task = NavigationTask(CONFIG, LOW_POLICY, 2, seed=3, training=False)
     task.reset(np.arange(2))
     for k in (1, 2):
         reward, *_ = task.step(np.zeros((2, 13)))
@@ -653,7 +654,7 @@ def test_the_reward_of_a_decision_is_the_sum_of_its_terms(steps):
 
 
 def test_contact_forces_are_the_largest_within_a_decision(steps):
-    task = NavigationTask(CONFIG, LOW, 1, seed=3, training=False)
+    task = NavigationTask(CONFIG, LOW_POLICY, 1, seed=3, training=False)
     task.reset(np.arange(1))
     executed, forces = task._executor.step, iter([0.0, 30.0, 10.0, 0.0, 5.0])
 
@@ -670,7 +671,7 @@ def test_contact_forces_are_the_largest_within_a_decision(steps):
 def test_base_height_is_above_the_support(steps):
     hardest = CONFIG.levels - 1
     config = dataclasses.replace(CONFIG, families=("stair",), first_level=hardest, first_levels=1)
-    task = NavigationTask(config, LOW, 1, seed=3, training=False)
+    task = NavigationTask(config, LOW_POLICY, 1, seed=3, training=False)
     task.reset(np.arange(1))
     loco, middle = task.locomotion, np.array([[4.0, 4.0]])
     loco.place(np.array([0]), task._origin + middle, np.zeros(1), np.zeros(1))
@@ -686,7 +687,7 @@ def test_base_height_is_above_the_support(steps):
 
 
 def test_a_new_episode_has_not_reached_its_goal():
-    task = NavigationTask(CONFIG, LOW, 2, seed=3, training=False)
+    task = NavigationTask(CONFIG, LOW_POLICY, 2, seed=3, training=False)
     task.reset(np.arange(2))
     task.goal[0] = task.locomotion.world.state.position[0, :2]
     task.step(np.zeros((2, 13)))
@@ -698,7 +699,7 @@ def test_a_new_episode_has_not_reached_its_goal():
 
 def test_a_robot_that_falls_neither_reaches_its_goal_nor_runs_out_of_time(monkeypatch):
     """Robot 0 falls in the control step after it has reached the goal, robot 1 at the horizon."""
-    task = NavigationTask(CONFIG, LOW, 2, seed=3, training=False)
+    task = NavigationTask(CONFIG, LOW_POLICY, 2, seed=3, training=False)
     task.reset(np.arange(2))
     task.elapsed[1] = task.horizon - 1
     outcomes = iter([np.array([FELL, FELL])] + [np.array([REACHED, FELL])] * 4)
@@ -710,7 +711,7 @@ def test_a_robot_that_falls_neither_reaches_its_goal_nor_runs_out_of_time(monkey
 
 def test_disturbances_widen_with_the_level():
     """Twenty robots on the easiest level are nominal and not pushed, twenty on the hardest vary."""
-    task = NavigationTask(CONFIG, LOW, 40, seed=3)
+    task = NavigationTask(CONFIG, LOW_POLICY, 40, seed=3)
     task.curriculum.levels[:] = np.repeat([0, CONFIG.levels - 1], 20)
     task.reset(np.arange(40))
     loco, world, speeds = task.locomotion, task.locomotion.world, np.zeros(40)
@@ -729,7 +730,7 @@ def test_disturbances_widen_with_the_level():
 
 def test_success_is_the_share_of_episodes_that_reached_the_goal():
     config = dataclasses.replace(CONFIG, families=("stair", "tilt"))
-    task = NavigationTask(config, LOW, 1, seed=3, training=False)
+    task = NavigationTask(config, LOW_POLICY, 1, seed=3, training=False)
     task.reset(np.arange(1))
     task.step(np.zeros((1, 13)))
     stats = task.take_stats()

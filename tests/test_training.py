@@ -955,9 +955,9 @@ def test_the_low_policy_is_what_the_first_command_left(
 
 @pytest.mark.usefixtures("inline_workers")
 def test_one_range_may_be_narrowed_and_the_others_stay_the_low_policys(tmp_path: Path) -> None:
-    low = policies.load(PRETRAINED / "low")
+    low, config = load_low(PRETRAINED / "low")
     wide = dataclasses.replace(CommandRanges(), vy=(-0.4, 0.4), pitch=(-0.2, 0.1))
-    config = dataclasses.replace(load_low(low)[1], commands=wide)
+    config = dataclasses.replace(config, commands=wide)
     policies.save_copy(tmp_path / "low", low, {**low.meta, "config": to_dict(config)})
     small = ["--steps", "96", "--n-envs", "4", "--workers", "1", "--time-limit", "0"]
     flags = ["--no-teacher", "--low", str(tmp_path / "low"), "--set", "env.commands.vx=[-0.5,0.5]"]

@@ -36,7 +36,7 @@ from tdgc.sim.terrain import (
 )
 from tdgc.sim.world import World
 from tdgc.tasks.executor import Carries, Executor
-from tdgc.tasks.pairing import load_low
+from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.rules import GOING, HORIZON, OUTCOMES, outcome
 
 BATCH = 50  # episodes per world: enough to keep numpy busy, few enough to distribute evenly
@@ -380,7 +380,7 @@ def run_cell(
     Returns:
         One episode per robot, in order.
     """
-    batch = Batch(cell, load_low(low)[1], seed)
+    batch = Batch(cell, mdp_of(low), seed)
     try:
         return closed_loop(driver, Executor(batch.loco, low, batch.sensors), batch, watchers)
     finally:

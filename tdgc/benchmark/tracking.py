@@ -18,7 +18,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EVAL_STREAM
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.pairing import load_low
+from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.rules import is_fallen
 
 _TRACKING_SECONDS = 10.0  # length of a tracking episode, which has one command
@@ -46,7 +46,7 @@ def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Lo
     Raises:
         FloatingPointError: a robot's state is not finite.
     """
-    config = load_low(low)[1]
+    config = mdp_of(low)
     physics = physics_of(config, CONDITIONS["nominal"])
     loco = Locomotion(m, config.robot, physics, None, config.gyro)
     executor, rows = Executor(loco, low), np.arange(m)
@@ -70,7 +70,7 @@ def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, fl
     every control step after the first second, and the share of foot samples in which contact is as
     desired.
     """
-    config, g = load_low(low)[1], GAITS.index(gait)
+    config, g = mdp_of(low), GAITS.index(gait)
     rng = np.random.default_rng((EVAL_STREAM, seed, g))
     command = draw_commands(rng, config.commands, np.full(episodes, g))
     settle = round(_SETTLE_SECONDS / config.physics.control_dt)
@@ -96,7 +96,7 @@ def count_falls(low: Policy, robots: int, seed: int) -> dict[str, float]:
 
     A fallen robot is not restarted; its time counts up to the fall.
     """
-    config = load_low(low)[1]
+    config = mdp_of(low)
     m, dt = robots, config.physics.control_dt
     rng = np.random.default_rng((EVAL_STREAM, seed, len(GAITS)))
     switch = round(_SWITCH_SECONDS / dt)

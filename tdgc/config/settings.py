@@ -13,37 +13,42 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from tdgc.errors import InputError
 
-#: Types of settings. The annotation is the constraint on a value, as worded in error messages.
-Range = typing.Annotated[tuple[float, float], "[low, high] with low <= high"]
-PositiveRange = typing.Annotated[tuple[float, float], "[low, high] with 0 < low <= high"]
-ShareRange = typing.Annotated[tuple[float, float], "[low, high] with 0 < low <= high < 1"]
-SharesRange = typing.Annotated[tuple[float, float], "[low, high] with 0 <= low <= high <= 1"]
-Share = typing.Annotated[float, "from 0 to 1"]
-Positive = typing.Annotated[float, "above 0"]
-NotNegative = typing.Annotated[float, "at least 0"]
-Weight = typing.Annotated[float, "from -100 to 100"]
-Whole = typing.Annotated[int, "at least 0"]
-Count = typing.Annotated[int, "at least 1"]
-#: Shares of trot, pronk, pace and bound.
-GaitShares = typing.Annotated[tuple[Share, Share, Share, Share], "shares that add up to 1"]
 
-_HOLDS: dict[Any, Callable[[Any], bool]] = {
-    Range: lambda bounds: bounds[0] <= bounds[1],
-    PositiveRange: lambda bounds: 0.0 < bounds[0] <= bounds[1],
-    ShareRange: lambda bounds: 0.0 < bounds[0] <= bounds[1] < 1.0,
-    SharesRange: lambda bounds: 0.0 <= bounds[0] <= bounds[1] <= 1.0,
-    Share: lambda share: 0.0 <= share <= 1.0,
-    Positive: lambda number: number > 0.0,
-    NotNegative: lambda number: number >= 0.0,
-    Weight: lambda weight: -100.0 <= weight <= 100.0,
-    Whole: lambda number: number >= 0,
-    Count: lambda number: number >= 1,
-    GaitShares: lambda shares: math.isclose(sum(shares), 1.0),
-}
+class Rule(NamedTuple):
+    """A constraint on the value of a setting, as worded in error messages, and whether it holds."""
+
+    says: str
+    holds: Callable[[Any], bool]
+
+
+# Types of settings, with their constraints.
+Share = Annotated[float, Rule("from 0 to 1", lambda x: 0.0 <= x <= 1.0)]
+Positive = Annotated[float, Rule("above 0", lambda x: x > 0.0)]
+NotNegative = Annotated[float, Rule("at least 0", lambda x: x >= 0.0)]
+Weight = Annotated[float, Rule("from -100 to 100", lambda x: -100.0 <= x <= 100.0)]
+Whole = Annotated[int, Rule("at least 0", lambda x: x >= 0)]
+Count = Annotated[int, Rule("at least 1", lambda x: x >= 1)]
+Range = Annotated[tuple[float, float], Rule("[low, high] with low <= high", lambda b: b[0] <= b[1])]
+PositiveRange = Annotated[
+    tuple[float, float], Rule("[low, high] with 0 < low <= high", lambda b: 0.0 < b[0] <= b[1])
+]
+ShareRange = Annotated[
+    tuple[float, float],
+    Rule("[low, high] with 0 < low <= high < 1", lambda b: 0.0 < b[0] <= b[1] < 1.0),
+]
+SharesRange = Annotated[
+    tuple[float, float],
+    Rule("[low, high] with 0 <= low <= high <= 1", lambda b: 0.0 <= b[0] <= b[1] <= 1.0),
+]
+#: Shares of trot, pronk, pace and bound.
+GaitShares = Annotated[
+    tuple[Share, Share, Share, Share],
+    Rule("shares that add up to 1", lambda shares: math.isclose(sum(shares), 1.0)),
+]
 
 
 class ConfigError(InputError):
@@ -205,11 +210,11 @@ def _coerce(hint: Any, value: Any, path: str) -> Any:
     """Convert ``value`` to the annotated type; only types that configurations use are supported."""
     origin = typing.get_origin(hint)
     shown = reprlib.repr(value)  # short, whatever the file contains
-    if origin is typing.Annotated:
+    if origin is Annotated:
         kind, rule = typing.get_args(hint)
         checked = _coerce(kind, value, path)
-        if not _HOLDS[hint](checked):
-            raise ConfigError(f"'{path}' must be {rule}, not {shown}")
+        if not rule.holds(checked):
+            raise ConfigError(f"'{path}' must be {rule.says}, not {shown}")
         return checked
     if origin is Literal:
         if value not in typing.get_args(hint):

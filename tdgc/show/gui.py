@@ -20,7 +20,7 @@ from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
 from tdgc.sim.world import Stage, WindowError
 from tdgc.tasks.executor import Executor
-from tdgc.tasks.pairing import load_low
+from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.rules import GOING, OUTCOMES, outcome
 
 MODES = ("drive", "watch")
@@ -80,7 +80,7 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
     Raises:
         WindowError: the window cannot be opened.
     """
-    config, tile = load_low(low)[1], tile_of(seed, cell.family, cell.level, cell.first)
+    config, tile = mdp_of(low), tile_of(seed, cell.family, cell.level, cell.first)
     stage, field = set_stage(tile, config.robot, window=True), TileField.of(tile)
     physics = physics_of(config, CONDITIONS["nominal"])
     loco = Locomotion(1, config.robot, physics, field, config.gyro)
@@ -150,7 +150,7 @@ def watch(low: Policy, driver: Driver, cell: Cell, seed: int) -> None:
         WindowError: the window cannot be opened.
     """
     tile = tile_of(seed, cell.family, cell.level, cell.first)
-    stage = set_stage(tile, load_low(low)[1].robot, window=True)
+    stage = set_stage(tile, mdp_of(low).robot, window=True)
     try:
         monitor = Monitor(stage)
         run_cell(cell, low, driver, seed, [monitor])

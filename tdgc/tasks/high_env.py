@@ -24,7 +24,7 @@ from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_observation import GUIDANCE, HighObserver, high_spaces, semantic_index
 from tdgc.tasks.high_rewards import HighReward
-from tdgc.tasks.pairing import PRETRAINED, load_low, paired
+from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of, paired
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import REACHED, episode_steps, has_failed, outcome
 from tdgc.tasks.statistics import Sums
@@ -43,7 +43,7 @@ class NavigationTask:
 
     Args:
         config: the MDP's configuration.
-        low: the low policy, or its path; a task built on another machine needs the policy itself.
+        low: the frozen low policy.
         num_robots: M.
         seed: seed of everything random in the task.
         training: draw disturbances and let the curriculum change levels.
@@ -59,7 +59,7 @@ class NavigationTask:
     def __init__(
         self,
         config: HighLevelConfig,
-        low: str | Path | Policy,
+        low: Policy,
         num_robots: int,
         seed: int,
         training: bool = True,
@@ -68,7 +68,7 @@ class NavigationTask:
         led: float = 0.0,
         first: int = 0,
     ) -> None:
-        self.low, self.low_config = load_low(low)
+        self.low, self.low_config = low, mdp_of(low)
         self.config = config = paired(config, self.low_config)
         self._visual = visual
         self.num_robots = m = num_robots
@@ -364,9 +364,10 @@ class NavigationEnv(TaskEnv):
         self.config = config or HighLevelConfig()
         check_families(self.config.families)
         check_levels(self.config.levels)
+        policy, _ = load_low(low)
         super().__init__(
             lambda seed, visual: NavigationTask(
-                self.config, low, 1, seed, visual=visual, first=seed % len(self.config.families)
+                self.config, policy, 1, seed, visual=visual, first=seed % len(self.config.families)
             ),
             render_mode,
         )

@@ -16,7 +16,7 @@ from tdgc.sim.commands import NUM_ACTIONS
 from tdgc.sim.terrain import MAX_LEVEL, may_have_trenches
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.pairing import load_low
+from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.teacher import Skill
 
 #: Walks that are tried besides the usual one: m/s, and Hz of the steps.
@@ -110,7 +110,7 @@ def arrivals(
     low: Policy, env: HighLevelConfig, manner: TeacherConfig, family: str, robots: int = ROBOTS
 ) -> int:
     """Count the robots that the teacher leads over tiles of levels 5 to 10, always the same."""
-    landing = measure_landing(*load_low(low), manner.leap_speed) if family == "gap" else None
+    landing = measure_landing(low, mdp_of(low), manner.leap_speed) if family == "gap" else None
     config = dataclasses.replace(
         env,
         families=(family,),

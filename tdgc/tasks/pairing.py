@@ -49,16 +49,25 @@ def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
     return dataclasses.replace(high, commands=ranges)
 
 
-def load_low(low: str | Path | Policy) -> tuple[Policy, LowLevelConfig]:
-    """A low policy, passed as such or as a path, and the MDP it was trained on.
+def mdp_of(low: Policy, source: object = "the low policy") -> LowLevelConfig:
+    """The MDP that a low policy was trained on.
+
+    Raises:
+        ConfigError: it is not a low policy; the message begins with ``source``.
+    """
+    if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
+        raise ConfigError(f"{source}: not a low policy of this package")
+    sizes = low.header.correction
+    if sizes and (sizes[0], sizes[-1]) != (NUM_COMMANDS, 3):
+        raise ConfigError(f"{source}: its correction is not one of the {NUM_COMMANDS} commands")
+    return recorded(LowLevelConfig, low.meta["config"], source)
+
+
+def load_low(path: str | Path) -> tuple[Policy, LowLevelConfig]:
+    """Load a low policy, and the MDP that it was trained on.
 
     Raises:
         ValueError: a file that cannot be used, or a policy that is not a low policy.
     """
-    name, low = low, low if isinstance(low, Policy) else policies.load(low)
-    if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
-        raise ConfigError(f"{name}: not a low policy of this package")
-    sizes = low.header.correction
-    if sizes and (sizes[0], sizes[-1]) != (NUM_COMMANDS, 3):
-        raise ConfigError(f"{name}: its correction is not one of the {NUM_COMMANDS} commands")
-    return low, recorded(LowLevelConfig, low.meta["config"], name)
+    low = policies.load(path)
+    return low, mdp_of(low, path)
