@@ -39,7 +39,7 @@ from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy
 from tdgc.show import film, gui, plots, report
 from tdgc.sim.geometry import read_geometry
-from tdgc.sim.world import WindowError
+from tdgc.sim.world import WindowError, World
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.manners import find_manner, manner_of
 from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of
@@ -242,7 +242,10 @@ class Evaluation:
             manner = find_manner(low, HighLevelConfig(), print)
         else:
             manner = manner_of(high, self.high)
-        return Skill(measure_landing(low, config, manner.leap_speed), manner)
+        landing = measure_landing(low, config, manner.leap_speed)
+        if landing is None:
+            print("the low policy falls when it leaps: scripts walk over trenches")
+        return Skill(landing, manner)
 
     def drivers(self, low: Policy, config: LowLevelConfig) -> dict[str, Driver]:
         """Make the driver of each policy; the tuned one follows ``tdgc``.
@@ -446,7 +449,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         evaluation = Evaluation.of(parse(arguments))
         low, config = load_low(evaluation.low)
-        read_geometry(config.robot)  # before the results of an earlier call are removed
+        World(1, config.robot, config.physics).close()  # fail before earlier results are removed
         drivers = evaluation.drivers(low, config)
         evaluation.make_room()
     except (ValueError, OSError) as error:

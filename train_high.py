@@ -373,6 +373,9 @@ def main(arguments: list[str] | None = None) -> int:
         path = find_low() if config.low is None else config.low
         low, low_config = load_low(path)
         config = pin_low(config, path)
+        taught = config.imitation.steps or args.init is not None or args.resume
+        if config.imitation.teacher is not None and not taught:
+            raise ConfigError("'imitation.teacher' has no effect without imitation")
         tqdm.write(f"low policy: {path}")
         check_robot(low_config.robot, low_config.physics, config.env.randomisation)
         config = dataclasses.replace(config, env=paired(config.env, low_config))

@@ -32,6 +32,7 @@ from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.parallel.jobs import run_jobs
 from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Correction, Policy
+from tdgc.policies.files import files_of
 from tdgc.sim.commands import NAMES, NUM_COMMANDS, SIDEWAYS, command_bounds
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.robot import Array
@@ -274,6 +275,8 @@ def main(arguments: list[str] | None = None) -> int:
                 f"{args.low} is calibrated already; give the policy from before, which "
                 "train_low.py keeps as 'uncalibrated' in its run folder"
             )
+        if files_of(args.out)[0].absolute() == files_of(args.low)[0].absolute():
+            raise ValueError(f"--out would replace --low, {args.low}; give another path")
         make_folder(args.out.parent)
     except (ValueError, OSError) as error:
         print(f"tdgc.calibration: {error}", file=sys.stderr)

@@ -33,7 +33,9 @@ from tdgc.sim.commands import INDEX
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
+from tdgc.sim.terrain import TileField
 from tdgc.sim.world import WindowError
+from tdgc.tasks.rules import HORIZON
 
 if TYPE_CHECKING:
     from tdgc.sim.mujoco_world import MujocoConfig
@@ -191,14 +193,17 @@ def show(args: argparse.Namespace, config: "MujocoConfig") -> None:
     """Show the first episode of the first family and level in MuJoCo's viewer.
 
     Raises:
-        WindowError: there is no display, or the window was closed.
+        WindowError: there is no display.
     """
     from tdgc.sim.mujoco_world import Window
 
     cell = Cell(POLICY, "nominal", args.families[0], args.levels[0], 0, 1)
     with Window() as window:
         pair = Deployed(load(args.export))
-        episode = run_episode(cell, pair, config, args.seed, [window], visual=True)
+        try:
+            episode = run_episode(cell, pair, config, args.seed, [window], visual=True)
+        except WindowError:
+            return  # the window was closed
     print(f"{episode.outcome.replace('_', ' ')}, {episode.time_s:.1f} s")
 
 
@@ -240,7 +245,7 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
         ValueError: the flags or the exported folder cannot be used.
     """
     require("MuJoCo's benchmark", _PACKAGES, "mujoco")
-    from tdgc.sim.mujoco_world import MujocoConfig
+    from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 
     flags.resolve(args)
     if not 0 <= args.log <= args.episodes:
@@ -250,8 +255,15 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
             raise ValueError(f"--gui only shows the robot: no {flag}")
     config = with_overrides(MujocoConfig(), args.assignments)
     controller = load(args.export)
-    controller.robot()
-    config.physics(controller.dt, controller.low.table["joint_control"]["rate"]["value"])
+    seconds = controller.horizon * controller.dt
+    if seconds < HORIZON:
+        raise ValueError(
+            f"the pair of {args.export} decides for {seconds:g} s only; the benchmark's episodes "
+            f"take up to {HORIZON:g} s"
+        )
+    rate = controller.low.table["joint_control"]["rate"]["value"]
+    physics = config.physics(controller.dt, rate)
+    MujocoWorld(controller.robot(), physics, TileField(1), config)  # whether MuJoCo can load it
     return config
 
 

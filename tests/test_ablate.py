@@ -293,16 +293,20 @@ def test_a_damaged_trial_is_named_and_the_others_are_kept(
 
 
 def test_a_report_has_all_that_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Later trials also while an earlier one is missing, and ``full`` although it is not asked for.
+    """Later trials also while an earlier one is missing, and those that are not asked for.
 
     The same folder on other tiles of a map is refused.
     """
-    for name in ("full-42", "trot-42"):
+    for name in ("full-42", "trot-42", "trot-7", "hardest-7", "gp", "unknown-42"):
         finish(tmp_path / name)
     asked = ["--only", "semantic,trot", "--time-limit", "0", "--out", str(tmp_path)]
     assert main([*TINY, *asked]) == 0
-    semantic, trot = json.loads((tmp_path / "ablation.json").read_text())["rows"]
-    assert (semantic["name"], trot["n"], trot["versus"]["n"]) == ("semantic", 1, 1)
+    table = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert [row["name"] for row in table] == ["full", "semantic", "trot", "hardest", "gp"]
+    full, semantic, trot, hardest, gp = table
+    assert (full["n"], trot["n"], trot["versus"]["n"], hardest["versus"], gp["n"]) == (
+        1, 2, 1, None, 1
+    )  # fmt: skip
     assert "n" not in semantic
     settings = json.loads((tmp_path / "settings.json").read_text())
     (tmp_path / "settings.json").write_text(json.dumps(settings | {"maps": {"hills.npy": 7}}))
@@ -341,7 +345,7 @@ def test_two_ablations_do_not_share_a_folder(
 
 @pytest.mark.parametrize(
     ("trained", "evaluated"),
-    [("gap,clutter,gap,ditches", "gap"), ("ditches,clutter", "ditches,clutter")],
+    [("gap,clutter,flat,gap,ditches", "gap"), ("ditches,clutter", "ditches,clutter")],
 )
 def test_ground_without_a_name_is_not_evaluated_on(trained: str, evaluated: str) -> None:
     """Families in ``UNNAMED`` are left out of the evaluation unless there are no others."""

@@ -231,6 +231,19 @@ def test_bad_input_is_one_line(
     assert said.err.count("\n") == 1 and not out.exists()
 
 
+def test_the_policy_from_before_is_not_replaced(
+    low: Policy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policies.save_copy(tmp_path / "low", low, low.meta)
+    before = (tmp_path / "low.json").read_bytes()
+    given = ["--low", str(tmp_path / "low.json"), "--out", str(tmp_path / "low")]
+    assert calibration.main(given) == 2
+    assert capsys.readouterr().err == (
+        f"tdgc.calibration: --out would replace --low, {tmp_path / 'low.json'}; give another path\n"
+    )
+    assert (tmp_path / "low.json").read_bytes() == before
+
+
 def test_where_nothing_can_be_written_nothing_is_calibrated(
     low: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

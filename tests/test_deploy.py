@@ -256,6 +256,41 @@ def test_a_reading_that_is_not_finite_is_refused_and_not_remembered(
         np.testing.assert_array_equal(controller.step(readings), expected[step])
 
 
+@pytest.mark.parametrize("name", ["gyro", "probes", "goal"])
+def test_a_missing_or_misshapen_reading_is_refused_and_not_remembered(
+    controller: Controller, name: str
+) -> None:
+    readings = controller.sense(state(controller), np.array([6.0, 0.0]), "rough", level)
+    controller.reset()
+    expected = [controller.step(readings) for _ in range(6)]
+    controller.reset()
+    for step in range(6):
+        if step == 5:  # a decision
+            lacking = {key: value for key, value in readings.items() if key != name}
+            with pytest.raises(ExportError, match=f"the reading '{name}' is missing$"):
+                controller.step(lacking)
+            with pytest.raises(ExportError, match=f"^'{name}' must have the shape .*, not "):
+                controller.step({**readings, name: np.zeros(40)})
+        np.testing.assert_array_equal(controller.step(readings), expected[step])
+
+
+def test_a_program_may_reuse_its_arrays(controller: Controller) -> None:
+    """The speed at which the goal comes closer follows from its position at the last decision."""
+    robot, ways = state(controller), []
+    for reuse in (False, True):
+        controller.reset()
+        readings = controller.sense(robot, np.array([6.0, 0.0]), "gap", level)
+        for step in range(11):
+            goal = np.array([6.0 - 0.02 * step, 0.0])
+            if reuse:
+                readings["goal"][:] = goal
+            else:
+                readings = readings | {"goal": goal}
+            controller.step(readings)
+        ways.append(controller.high.values["decision"].copy())
+    np.testing.assert_array_equal(*ways)
+
+
 def test_it_stands_after_the_goal_and_after_the_horizon(controller: Controller) -> None:
     task = controller.high.table["task"]
     stand = np.array(task["stand"]["value"])
@@ -524,6 +559,11 @@ STANDING = nominal_pose(RobotConfig())
         ({"gravity": [0.0, -1.0, 0.0]}, "upright it must be about [0.0, 0.0, -1.0], frames.grav"),
         ({"joint_angles": np.degrees(STANDING)}, "has 5.73 for FL_hip_joint, which turns from -0"),
         ({"joint_angles": -STANDING}, "has 1.5 for FL_calf_joint, which turns from -2.82 to -0.89"),
+        ({"joint_speeds": [300.0] * 12}, "'joint_speeds' at 0.00 s means 300 rad/s, more than any"),
+        (
+            {"gyro": [0.0, 0.0, -57.3]},
+            "'gyro' at 0.00 s means 57.3 rad/s, more than any robot's 35;",
+        ),
         ({"family": [0.0] * 6}, "is [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]; it must be 1 for one of rough"),
         ({"family": [0.0, 0.5, 0.5, 0.0, 0.0, 0.0]}, "tilt, unknown and 0 for the others"),
         ({"family": [0.0, 0.0, 2.0, 0.0, 0.0, 0.0]}, "'family' at 0.00 s is [0.0, 0.0, 2.0, "),
@@ -536,6 +576,32 @@ def test_readings_in_another_unit_or_convention_are_refused(
     with pytest.raises(LogError) as refused:
         log.read(changed(walk, tmp_path, **table), controller)
     assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_heading_in_degrees_is_refused(
+    controller: Controller, walk: Path, tmp_path: Path
+) -> None:
+    """Of a robot that turns by 1 rad/s, across the end of the range."""
+    yaw = 3.0 + 0.02 * np.arange(12)
+    around = (yaw + np.pi) % (2.0 * np.pi) - np.pi
+    log.read(changed(walk, tmp_path, yaw=around[:, None]), controller)
+    message = "'yaw' at 0.00 s means 57.3 rad/s, more than any robot's 35; it must be in rad"
+    with pytest.raises(LogError, match=f"{message}$"):
+        log.read(changed(walk, tmp_path, yaw=np.degrees(around)[:, None]), controller)
+
+
+def test_a_writer_needs_no_heading(controller: Controller, tmp_path: Path) -> None:
+    writer = LogWriter(controller)
+    readings = controller.sense(state(controller), np.array([5.0, 1.0]), "stair", level)
+    del readings["yaw"]
+    controller.reset()
+    for _ in range(6):
+        controller.step(readings)
+        writer.add(readings)
+    writer.end(readings)
+    writer.save(tmp_path / "blind.npz")
+    found = log.read(tmp_path / "blind.npz", controller)
+    assert "yaw" not in found.values and "gyro" in found.values
 
 
 def test_a_log_of_noisy_sensors_and_a_fall_is_read(controller: Controller, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ import pytest
 from test_drivers import save_high
 
 import evaluate
+from tdgc import policies
 from tdgc.benchmark import evaluation, tracking
 from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import (
@@ -56,6 +57,7 @@ from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EDITION
+from tdgc.sim.urdf import urdf_path
 from tdgc.sim.world import World
 from tdgc.tasks import manners
 from tdgc.tasks.executor import Executor
@@ -609,6 +611,23 @@ def test_without_a_complete_cell_there_is_no_table(tmp_path, monkeypatch, capsys
     said = f"evaluate.py: {DIED}; no table, as 0 of 4 episodes are of complete cells"
     assert capsys.readouterr().err.splitlines()[-1] == said
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_results_stay_if_the_robot_cannot_be_loaded(low, tmp_path, capsys):
+    text = urdf_path(mdp_of(low).robot).read_text()
+    box = '<geometry><box size="0.42 0.15 0.11"/></geometry>'
+    mesh = text.replace(box, '<geometry><mesh filename="absent.obj"/></geometry>')
+    assert mesh != text
+    (tmp_path / "robot.urdf").write_text(mesh)
+    robot = {**low.meta["config"]["robot"], "urdf": str(tmp_path / "robot.urdf")}
+    config = {**low.meta["config"], "robot": robot}
+    policies.save_copy(tmp_path / "low", low, {**low.meta, "config": config})
+    (tmp_path / "summary.json").write_text("earlier")
+    flags = ["--policies", "gp", "--low", str(tmp_path / "low"), "--out", str(tmp_path)]
+    assert evaluate.main([*FOUR, *flags]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("evaluate.py: ") and said.count("\n") == 1 and "robot.urdf" in said
+    assert (tmp_path / "summary.json").read_text() == "earlier"
 
 
 def test_ctrl_c_stops_what_called_the_script_too(tmp_path, monkeypatch):

@@ -473,6 +473,25 @@ def test_a_teacher_shows_its_actions_and_leads_fewer_and_fewer_episodes():
         task.close()
 
 
+def test_the_hardest_level_is_trained_on_alone_also_when_resumed():
+    config = dataclasses.replace(CONFIG, families=("stair",), curriculum="uniform")
+    task = NavigationTask(config, LOW_POLICY, 4, seed=0)
+    hardest = NavigationTask(
+        dataclasses.replace(config, curriculum="hardest"), LOW_POLICY, 4, seed=0
+    )
+    try:
+        task.reset(np.arange(4))
+        assert (task.tiles.level < 10).any()
+        hardest.load_state_dict(task.state_dict())
+        assert hardest.tiles.level.tolist() == task.tiles.level.tolist()
+        hardest.reset(np.array([1, 2]))
+        assert hardest.tiles.level[[1, 2]].tolist() == [10, 10]
+        assert hardest.tiles.level[[0, 3]].tolist() == task.tiles.level[[0, 3]].tolist()
+    finally:
+        task.close()
+        hardest.close()
+
+
 @pytest.mark.parametrize("taught", [None, Skill()])
 @pytest.mark.parametrize("episodes", [True, False])
 def test_the_future_follows_from_the_state(episodes, taught):

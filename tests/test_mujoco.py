@@ -185,6 +185,14 @@ def test_joint_friction_stops_a_swinging_leg() -> None:
     assert speeds[0] > 2.0 and speeds[1] < 0.7 * speeds[0]
 
 
+def test_a_simulation_that_diverges_does_not_start_again() -> None:
+    world = make_world()
+    place(world)
+    world.data.qvel[0] = 1e12
+    hold(world, 0.02)
+    assert not np.isfinite(world.state.position).all()
+
+
 def test_a_timestep_must_fit_the_control() -> None:
     physics = MujocoConfig(timestep=0.001).physics(0.02, 200.0)
     assert (physics.substeps, physics.hold, physics.joint_steps) == (20, 5, 4)
@@ -539,18 +547,25 @@ def test_what_is_complete_when_it_is_stopped_is_kept(
         ),
         ("--set armature=NaN", "'armature' must be"),
         ("--export {0}/old", "an interface of version 1, this package reads "),
+        (
+            "--export {0}/brief",
+            "/brief decides for 10 s only; the benchmark's episodes take up to 20",
+        ),
         ("--export {0}/robot", "FL_calf_joint turns from -2.82 to -0.7 rad, that robot's from"),
     ],
 )
 def test_bad_input_is_one_line(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: str, message: str
 ) -> None:
-    for name in ("old", "robot"):
+    for name in ("old", "robot", "brief"):
         (tmp_path / name).mkdir()
         for path in folder.iterdir():
             (tmp_path / name / path.name).write_bytes(path.read_bytes())
     table = json.loads((folder / "low_interface.json").read_text())
     (tmp_path / "old" / "low_interface.json").write_text(json.dumps(table | {"version": 1}))
+    table = json.loads((folder / "high_interface.json").read_text())
+    table["task"]["horizon"]["value"] = 10.0
+    (tmp_path / "brief" / "high_interface.json").write_text(json.dumps(table))
     urdf = (folder / "quadruped.urdf").read_text().replace('upper="-0.89"', 'upper="-0.7"')
     (tmp_path / "robot" / "quadruped.urdf").write_text(urdf)
     out = tmp_path / "out"

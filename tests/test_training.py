@@ -462,6 +462,12 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     for flags in (["--seed", "4"], ["--set", "seed=4"]):
         assert train_low.main(["--resume", "--out", str(broken), *flags]) == 2
         assert "--resume keeps the run's seed, 3: no other seed" in "".join(capfd.readouterr())
+    for name, before, now in (
+        ("ppo.initial_std", 1.0, 0.5), ("env.command_start", 0.4, 0.5), ("env.first_levels", 3, 1)
+    ):  # fmt: skip
+        assert train_low.main(["--resume", "--out", str(broken), "--set", f"{name}={now}"]) == 2
+        said = f"--resume keeps the run's {name}, {before}: no other {name}\n"
+        assert capfd.readouterr().err.endswith(said)
     assert (broken / "config.json").read_text(encoding="utf-8") == config
     last = broken / "checkpoints/step-000000000096"
     kill_run("train_low.py", ["--resume", "--out", str(broken)], last)
@@ -531,6 +537,8 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert train_high.main(["--resume", "--out", str(broken), "--low", str(other)]) == 2
     error = capsys.readouterr().err
     assert f"train_high.py: {other} is not the low policy that this run began with" in error
+    assert train_high.main(["--resume", "--out", str(broken), "--set", "start_speed=0.3"]) == 2
+    assert "keeps the run's start_speed, 0.5: no other start_speed" in capsys.readouterr().err
     assert (broken / "config.json").read_text(encoding="utf-8") == config
     kill_run("train_high.py", ["--resume", "--out", str(broken)], last, after=0.05)
     cut = Checkpoint.read(newest(broken))
@@ -828,6 +836,9 @@ def test_flags_and_folders_that_cannot_be_used(
     drawn = ["--no-teacher", "--set", "env.curriculum=uniform", "--set", "env.first_level=3"]
     assert train_high.main([*drawn, "--out", str(empty)]) == 2
     assert "have no effect with env.curriculum uniform" in capsys.readouterr().err
+    told = ["--no-teacher", "--set", "imitation.teacher.walk_speed=0.9"]
+    assert train_high.main([*told, "--out", str(empty)]) == 2
+    assert "'imitation.teacher' has no effect without imitation" in capsys.readouterr().err
     alone = ["--set", "ppo.lstm=null"]
     assert train_high.main([*alone, "--out", str(empty)]) == 2
     assert "'ppo.encoder' must be [] if 'ppo.lstm' is null" in capsys.readouterr().err

@@ -176,13 +176,30 @@ def report(
     trials: Sequence[Trial],
     found: Mapping[Trial, Found],
 ) -> str:
-    """Write ablation.json, ablation.txt and ablation.png of the results so far; return the text."""
-    table = rows(tiles, trials, found)
+    """Write ablation.json, ablation.txt and ablation.png; return the text.
+
+    They have a row for each variant of ``trials`` and for each other that was ``found``.
+    """
+    order = variants(common["no_teacher"])
+    every = sorted(dict.fromkeys([*trials, *found]), key=lambda trial: order.index(trial.variant))
+    table = rows(tiles, every, found)
     described = describe(table)
     write_json(out / "ablation.json", {"settings": common, "rows": table})
     write_text(out / "ablation.txt", f"{described}\n")
     plots.ablation(out / "ablation.json", out / "ablation.png")
     return described
+
+
+def finished(runner: Runner) -> list[Trial]:
+    """The trials in the folder that were finished, now or by earlier calls."""
+    done: list[Trial] = []
+    for variant in variants(runner.alone):
+        seeds: Sequence[int | None] = [None]
+        if variant.policy == "tdgc":
+            ends = (path.name.removeprefix(f"{variant.name}-") for path in runner.out.iterdir())
+            seeds = sorted(int(end) for end in ends if end.isdecimal())
+        done += [trial for seed in seeds if runner.done(trial := Trial(variant, seed))]
+    return done
 
 
 def conduct(
@@ -191,8 +208,8 @@ def conduct(
     """Run ``trials`` one after the other, and write a report after each.
 
     Returns:
-        The results of the trials that were run, now or before, and of ``full`` with their seeds;
-        and whether all were run: False after a signal or at the time limit.
+        The results of all trials in the folder that were run, now or before; and whether all of
+        ``trials`` were run: False after a signal or at the time limit.
     """
 
     def result(trial: Trial) -> Found:
@@ -201,9 +218,7 @@ def conduct(
         except TrialError as error:
             return str(error)
 
-    whole = variants(runner.alone)[0]
-    known = [*trials, *(Trial(whole, trial.seed) for trial in trials if trial.seed is not None)]
-    found = {trial: result(trial) for trial in dict.fromkeys(known) if runner.done(trial)}
+    found = {trial: result(trial) for trial in finished(runner)}
     for trial in trials:
         if trial in found:
             continue

@@ -31,6 +31,7 @@ from tdgc.parallel.cores import Workers
 from tdgc.sim.terrain import UNNAMED
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import OUTCOMES
+from tdgc.tasks.tiles import FLAT
 
 #: Family, level and number of a tile.
 Tile = tuple[str, int, int]
@@ -168,7 +169,7 @@ class Runner:
     def evaluation_flags(self, policy: str, low: Path, high: Path | None) -> list[object]:
         """Flags of evaluate.py; the tiles are the same for all variants."""
         env = with_overrides(HighTrainConfig(), self.settings).env
-        families = dict.fromkeys(name for name in env.families if name not in UNNAMED)
+        families = dict.fromkeys(name for name in env.families if name not in (*UNNAMED, FLAT))
         flags: list[object] = [
             *("--policies", policy, "--levels", self.levels, "--episodes", self.episodes),
             *("--families", ",".join(families or dict.fromkeys(env.families))),

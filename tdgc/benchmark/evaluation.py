@@ -40,7 +40,7 @@ from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.rules import GOING, HORIZON, OUTCOMES, outcome
 
 BATCH = 50  # episodes per world: enough to keep numpy busy, few enough to distribute evenly
-POSE_SECONDS = 0.2  # s between two poses of a track, in which a robot walks 20 cm at most
+POSE_SECONDS = 0.2  # s between two poses of a track, in which a robot moves 24 cm at most
 
 
 @dataclass(frozen=True)

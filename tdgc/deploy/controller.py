@@ -61,14 +61,23 @@ class Graph:
         """Begin a new episode."""
         self.memory, self.values, self.seconds = dict(self._start), dict[str, Array](), 0.0
 
-    def check(self, values: dict[str, Array]) -> None:
-        """Check that the inputs among ``values`` are finite.
+    def check(self, readings: dict[str, Array]) -> None:
+        """Check that the readings which the graph takes are there, of the right shape and finite.
 
         Raises:
-            ExportError: one is not; ``memory`` would not be finite from then on.
+            ExportError: one is not; ``memory`` would be wrong from then on.
         """
-        for name in self._inputs:
-            if name in values and not np.isfinite(values[name]).all():
+        for signal in self.table["inputs"]:
+            name, shape = signal["name"], tuple(signal["shape"])
+            if name not in readings:
+                if name in self.memory or signal["source"] is not None:
+                    continue
+                raise ExportError(f"{self._name}: the reading '{name}' is missing")
+            if np.shape(readings[name]) != shape:
+                raise ExportError(
+                    f"'{name}' must have the shape {shape}, not {np.shape(readings[name])}"
+                )
+            if not np.isfinite(readings[name]).all():
                 raise ExportError(f"'{name}' is not finite; give the last good reading instead")
 
     def __call__(self, values: dict[str, Array]) -> dict[str, Array]:
@@ -81,7 +90,8 @@ class Graph:
         """
         known = self.memory | values
         try:
-            inputs = [known[name] for name in self._inputs]
+            # Copies, because a robot's program may reuse its arrays, and some are remembered.
+            inputs = [np.array(known[name], dtype=np.float64) for name in self._inputs]
         except KeyError as error:
             raise ExportError(f"{self._name}: nothing gives its input {error}") from error
         started = time.thread_time()
@@ -303,9 +313,13 @@ class Controller:
         Once ``high`` has stopped (``over``), ``low`` gets the interface's commands ``stand``.
 
         Raises:
-            ExportError: a reading is not finite. The graphs have not run, and remember nothing.
+            ExportError: a reading is missing, has the wrong shape or is not finite. The graphs
+                have not run, and remember nothing.
         """
         task, elapsed = self._task, self.count * self.dt
+        if "goal" not in readings:  # also where ``high`` is not due
+            raise ExportError("the reading 'goal' is missing")
+        readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
         if np.linalg.norm(readings["goal"]) < task["goal_radius"]["value"]:
             self._reached_at = self.count if self._reached_at is None else self._reached_at
         over = self.over(self.count, self._reached_at)
@@ -316,7 +330,6 @@ class Controller:
         ]
         for name in due:
             self._graphs[name].check(readings)
-        readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
         self.decided, self.seconds = False, 0.0
         for name in due:
             graph = self._graphs[name]

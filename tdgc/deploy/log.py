@@ -29,7 +29,7 @@ from tdgc.benchmark.trace import (
 from tdgc.deploy.controller import Controller
 from tdgc.errors import InputError
 from tdgc.sim.commands import INDEX
-from tdgc.sim.robot import Array
+from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import file_label
 
 SENSED = ("gravity", "joint_angles", "joint_speeds", "goal")  # in every row
@@ -50,6 +50,10 @@ _LENGTH = 0.1
 # rad beyond a joint's limits: simulated joints and the errors of their sensors reach 0.04; the calf
 # of a standing robot is 2.4 beyond with the wrong sign, and 83 in degrees.
 _BEYOND = 1.0
+# Times the speed limit of the joints: impacts throw simulated joints at up to twice it; a trot's
+# speeds in degrees are above 10 times.
+_OVER = 5.0
+_TURN = 35.0  # rad/s: the usual range of gyros, 2000 degrees/s
 
 
 class LogError(InputError):
@@ -117,6 +121,9 @@ class LogWriter:
             OSError: the file cannot be written.
         """
         columns = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
+        for name in OPTIONAL:
+            if np.isnan(columns[name]).all():  # never given
+                del columns[name]
         np.savez_compressed(path, allow_pickle=False, **columns)
 
 
@@ -267,6 +274,18 @@ def _misread(log: Log, controller: Controller) -> str | None:
             f"which turns from {ends[0, j]:g} to {ends[1, j]:g} rad; it must be in rad, along "
             "joint_control.axes"
         )
+    turned = wrap_angle(np.diff(log.values.get("yaw", np.zeros((1, 1))), axis=0)) / controller.dt
+    fastest = _OVER * max(low["joint_control"]["speed_limit"]["value"])
+    for name, speeds, limit, must in (
+        ("joint_speeds", log.values["joint_speeds"], fastest, "be in rad/s"),
+        ("gyro", log.values.get("gyro", turned), _TURN, "be in rad/s"),
+        ("yaw", turned, _TURN, "be in rad"),
+    ):
+        for k, j in np.argwhere(np.abs(speeds) > limit):
+            return (
+                f"'{name}' at {time[k]:.2f} s means {abs(speeds[k, j]):.3g} rad/s, more than any "
+                f"robot's {limit:g}; it must {must}"
+            )
     for k in log.decisions if "family" in log.values else ():
         told, families = log.values["family"][k], high["families"]
         if np.abs(told - np.eye(len(families))[told.argmax()]).max() > _SAME:

@@ -1,6 +1,7 @@
 """Command-line flags shared by both trainers, and the configuration built from them."""
 
 import argparse
+import functools
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -13,6 +14,7 @@ from tdgc.config import (
     LowTrainConfig,
     read_json,
     recorded,
+    to_dict,
     with_overrides,
 )
 from tdgc.files import make_folder
@@ -23,6 +25,11 @@ from tdgc.parallel.worker import MakeLink, ProcessLink
 _LONGEST = 86400.0  # s, of a worker's silence: one day; waiting on a pipe overflows at 25 days
 TrainConfig = TypeVar("TrainConfig", LowTrainConfig, HighTrainConfig)
 _TRAINERS = {LowTrainConfig: "train_low.py", HighTrainConfig: "train_high.py"}
+#: Settings that act when a run begins, so that a resumed run cannot change them.
+_AT_START = (
+    "seed", "start_speed", "start_swing", "ppo.initial_std", "ppo.initial_gait_std",
+    "env.first_level", "env.first_levels", "env.command_start",
+)  # fmt: skip
 
 
 class Machine(NamedTuple):
@@ -95,7 +102,7 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
         PolicyFileError: the policy of ``--init`` cannot be read.
         ClusterError: the cluster cannot be used, or has fewer CPUs than there are workers.
     """
-    stored, seed = args.out / "config.json", None
+    stored = args.out / "config.json"
     if not 0.0 < args.worker_timeout <= _LONGEST:
         raise ConfigError(
             f"--worker-timeout must be above 0 and at most {_LONGEST:g}, "
@@ -112,7 +119,6 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
         table = read_json(stored)
         try:
             config = recorded(type(config), table, stored)
-            seed = config.seed
         except ConfigError as error:
             for other, script in _TRAINERS.items():
                 if _fits(other, table):
@@ -128,9 +134,9 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
         policies.load(args.init)  # fail before anything is written
     flags = {k: getattr(args, k) for k in ("seed", "n_envs", "workers", "steps")}
     given: list[str] = [f"{k}={v}" for k, v in flags.items() if v not in (None, "auto")]
-    config = with_overrides(config, [*given, *args.assignments])
-    if seed not in (None, config.seed):
-        raise ConfigError(f"--resume keeps the run's seed, {seed}: no other seed")
+    before, config = config, with_overrides(config, [*given, *args.assignments])
+    if args.resume:
+        _keep_start(to_dict(before), to_dict(config))
     cores = usable_cores() if args.cluster is None else connect(args.cluster)
     if args.workers == "auto" and not args.resume:  # a resumed run keeps its number of workers
         workers = auto_workers(config.n_envs, cores)
@@ -140,6 +146,19 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
     if config.workers > config.n_envs:
         raise ConfigError(f"workers must be 1 to the {config.n_envs} robots, not {config.workers}")
     return config
+
+
+def _keep_start(before: Any, now: Any) -> None:
+    """Check that a resumed run does not change a setting of ``_AT_START``.
+
+    Raises:
+        ConfigError: names the setting and its value.
+    """
+    for name in _AT_START:
+        *tables, key = name.split(".")
+        then, new = (functools.reduce(dict.__getitem__, tables, table) for table in (before, now))
+        if key in then and new[key] != then[key]:
+            raise ConfigError(f"--resume keeps the run's {name}, {then[key]}: no other {name}")
 
 
 def _fits(kind: type[LowTrainConfig] | type[HighTrainConfig], table: Any) -> bool:

@@ -250,6 +250,8 @@ def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
     option = spec.option
     option.timestep, option.gravity = config.timestep, [0.0, 0.0, -GRAVITY]
     option.cone, option.impratio = _CONES[config.cone], config.impratio
+    # Otherwise a simulation that diverges starts again at the origin, which looks like a fall.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]  # the window's only light
     for geom in spec.geoms:
         geom.solref, geom.condim = [config.solref, 1.0], 3

@@ -124,9 +124,11 @@ class NavigationTask:
 
     def reset(self, index: NDArray[np.integer]) -> None:
         """Start new episodes for the robots ``index`` (n,)."""
-        n, rng = len(index), self.rng
+        n, rng, levels = len(index), self.rng, self.config.levels
         if self.training and self.config.curriculum == "uniform":
-            self.curriculum.levels[index] = rng.integers(self.config.levels, size=n)
+            self.curriculum.levels[index] = rng.integers(levels, size=n)
+        elif self.training and self.config.curriculum == "hardest":
+            self.curriculum.levels[index] = levels - 1  # a resumed run may have had others
         changed = self.tiles.begin(index, self.curriculum.levels)
         if changed.size:
             self.locomotion.world.upload_terrain(changed)
