@@ -25,12 +25,12 @@ from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, Teac
 from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, plan, run_cell
 from tdgc.benchmark.flags import add_arguments, choose, resolve
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import STOPS, describe, make_room, salvage, write_results
+from tdgc.benchmark.results import FAILURES, describe, make_room, salvage, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
-from tdgc.errors import InputError, require, what_stopped
+from tdgc.errors import InputError, interruptible, require, what_stopped
 from tdgc.files import make_folder, write_json
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
@@ -442,6 +442,7 @@ def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver
         pass  # equivalent to closing the window
 
 
+@interruptible("evaluate.py")
 def main(arguments: list[str] | None = None) -> int:
     def fail(error: object) -> None:
         print(f"evaluate.py: {error}", file=sys.stderr)
@@ -455,9 +456,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         fail(error)
         return 2
-    except KeyboardInterrupt as error:  # while the teacher's speeds are tried out
-        fail(what_stopped(error))
-        sys.exit(1)  # instead of returning, so that the caller stops, too
     problems: list[str] = []
     try:
         if evaluation.mode == "tracking":
@@ -469,10 +467,8 @@ def main(arguments: list[str] | None = None) -> int:
     except (InputError, WindowError) as error:  # no robot, terrain or window where it is needed
         fail(what_stopped(error))
         return 2
-    except STOPS as error:
+    except FAILURES as error:
         fail(what_stopped(error))
-        if isinstance(error, KeyboardInterrupt):
-            sys.exit(1)  # instead of returning, so that the caller stops, too
         return 1
     for problem in problems:
         fail(problem)

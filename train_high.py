@@ -31,7 +31,7 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.errors import what_stopped
+from tdgc.errors import interruptible, what_stopped
 from tdgc.files import checksum
 from tdgc.learn.flags import Machine, add_arguments, configure, make_run_folder
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
@@ -344,6 +344,7 @@ def check(config: HighTrainConfig, control_dt: float) -> None:
     start_action(config)
 
 
+@interruptible("train_high.py")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_arguments(parser, "runs/high", HighTrainConfig(), "decisions")
@@ -402,9 +403,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, WorkerError, OSError) as error:
         print(f"train_high.py: {what_stopped(error)}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
-    except KeyboardInterrupt as error:
-        print(f"train_high.py: {what_stopped(error)}", file=sys.stderr)
-        sys.exit(1)  # instead of returning, so that a caller stops, too
     return 0
 
 

@@ -29,7 +29,7 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.errors import StoppedError, what_stopped
+from tdgc.errors import StoppedError, interruptible, what_stopped
 from tdgc.learn.flags import Machine, add_arguments, configure, make_run_folder
 from tdgc.learn.ppo import NoiseScaledRate, check_batch, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
@@ -196,6 +196,7 @@ def build(
     return model, env
 
 
+@interruptible("train_low.py")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_arguments(parser, "runs/low", LowTrainConfig(), "control steps")
@@ -225,9 +226,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, WorkerError, OSError) as error:
         print(f"train_low.py: {what_stopped(error)}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
-    except KeyboardInterrupt as error:
-        print(f"train_low.py: {what_stopped(error)}", file=sys.stderr)
-        sys.exit(1)  # instead of returning, so that a caller stops, too
     return 0
 
 

@@ -33,7 +33,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.logger import Logger
 
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
-from tdgc.errors import InputError, what_stopped
+from tdgc.errors import InputError, interruptible, what_stopped
 from tdgc.files import make_folder, write_json
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
@@ -351,6 +351,7 @@ def choose_workers(args: argparse.Namespace) -> int:
     return workers
 
 
+@interruptible("tdgc.bench")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.bench", description=(__doc__ or "").partition("\n")[0]
@@ -397,9 +398,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (WorkerError, OSError) as error:
         print(f"tdgc.bench: {what_stopped(error)}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt as error:
-        print(f"tdgc.bench: {what_stopped(error)}", file=sys.stderr)
-        sys.exit(1)  # instead of returning, so that a caller stops, too
     return 0
 
 

@@ -26,7 +26,7 @@ from torch import nn
 from tdgc import policies
 from tdgc.benchmark.tracking import draw_commands, walk_on_plane
 from tdgc.config import CalibrationConfig, CommandRanges, ConfigError
-from tdgc.errors import what_stopped
+from tdgc.errors import interruptible, what_stopped
 from tdgc.files import make_folder
 from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.parallel.jobs import run_jobs
@@ -245,6 +245,7 @@ def calibrate(
     }  # fmt: skip
 
 
+@interruptible("tdgc.calibration")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.calibration", description=(__doc__ or "").partition("\n")[0]
@@ -288,9 +289,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, WorkerError, OSError) as error:
         print(f"tdgc.calibration: {what_stopped(error)}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
-    except KeyboardInterrupt as error:
-        print(f"tdgc.calibration: {what_stopped(error)}", file=sys.stderr)
-        sys.exit(1)  # instead of returning, so that a caller stops, too
     print(
         f"{facts['walked']:.0f} of {args.robots} robots walked; the fit predicts what commands "
         f"lead to within {facts['error_vx_m_s']:.3f} and {facts['error_vy_m_s']:.3f} m/s and "

@@ -14,10 +14,11 @@ from pathlib import Path
 from tdgc.benchmark import diagnosis, trace
 from tdgc.deploy import log
 from tdgc.deploy.controller import Controller
-from tdgc.errors import require
+from tdgc.errors import interruptible, require
 from tdgc.sim.geometry import read_geometry
 
 
+@interruptible("tdgc.diagnose")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.diagnose", description=(__doc__ or "").partition("\n")[0]

@@ -1,7 +1,11 @@
 """Errors about unusable input, interruptions, one-line descriptions of both, and a check for
 optional packages."""
 
+import functools
 import importlib.util
+import sys
+from collections.abc import Callable
+from typing import ParamSpec
 
 
 class InputError(ValueError):
@@ -31,6 +35,27 @@ def what_stopped(error: BaseException) -> str:
     if isinstance(error, KeyboardInterrupt):
         said = f"stopped by {str(error) or 'Ctrl-C'}"
     return "; ".join([said, *getattr(error, "__notes__", ())])
+
+
+P = ParamSpec("P")
+
+
+def interruptible(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
+    """Decorate a script's ``main``, so that Ctrl-C ends it with one line, which begins with
+    ``name``, and exit status 1."""
+
+    def decorate(main: Callable[P, int]) -> Callable[P, int]:
+        @functools.wraps(main)
+        def run(*args: P.args, **keywords: P.kwargs) -> int:
+            try:
+                return main(*args, **keywords)
+            except KeyboardInterrupt as error:
+                print(f"{name}: {what_stopped(error)}", file=sys.stderr)
+                sys.exit(1)  # instead of returning, so that a caller stops, too
+
+        return run
+
+    return decorate
 
 
 def require(what: str, packages: tuple[str, ...], extra: str) -> None:

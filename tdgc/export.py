@@ -38,7 +38,7 @@ from tdgc.config import (
 from tdgc.deploy.controller import FORMATS, Controller, quiet
 from tdgc.deploy.graphs import HighGraph, LowGraph, Signal
 from tdgc.deploy.interface import VERSION, Table, interface_path
-from tdgc.errors import require
+from tdgc.errors import interruptible, require
 from tdgc.files import checksum, write_text
 from tdgc.policies import Policy
 from tdgc.sim.commands import (
@@ -522,6 +522,7 @@ def _choose_formats(text: str) -> list[str]:
     return names
 
 
+@interruptible("tdgc.export")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.export", description=(__doc__ or "").partition("\n")[0]

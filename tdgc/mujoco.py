@@ -21,11 +21,11 @@ from tdgc.benchmark import flags
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Batch, Cell, Episode, Watcher, closed_loop, plan
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import STOPS, describe, make_room, salvage, write_results
+from tdgc.benchmark.results import FAILURES, describe, make_room, salvage, write_results
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
-from tdgc.errors import require, what_stopped
+from tdgc.errors import interruptible, require, what_stopped
 from tdgc.files import write_json
 from tdgc.parallel.jobs import run_jobs
 from tdgc.show import film
@@ -163,7 +163,7 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     """Run all cells and write all results; return problems with the films, one line each.
 
     Raises:
-        Exception: one of ``STOPS`` occurred; the table of the complete cells is still written.
+        Exception: one of ``FAILURES`` occurred; the table of the complete cells is still written.
     """
     settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
     write_json(args.out / "settings.json", settings)
@@ -267,6 +267,7 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
     return config
 
 
+@interruptible("tdgc.mujoco")
 def main(arguments: list[str] | None = None) -> int:
     def fail(error: object) -> None:
         print(f"tdgc.mujoco: {error}", file=sys.stderr)
@@ -289,7 +290,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, WindowError) as error:  # no robot, terrain or window where it is needed
         fail(what_stopped(error))
         return 2
-    except STOPS as error:
+    except FAILURES as error:
         problems = [what_stopped(error)]
     for problem in problems:
         fail(problem)

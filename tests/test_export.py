@@ -757,3 +757,15 @@ def test_missing_package_names_the_extra(
     said = capsys.readouterr()
     assert "format onnx,torchscript needs onnxscript: install the extra 'export'" in said.err
     assert said.err.count("\n") == 1 and not out.exists()
+
+
+def test_ctrl_c_is_one_line_and_stops_a_caller_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(export, "load_pair", stop)
+    with pytest.raises(SystemExit, match=r"^1$"):
+        export.main(["--format", "torchscript", "--out", str(tmp_path)])
+    assert capsys.readouterr().err == "tdgc.export: stopped by Ctrl-C\n"

@@ -25,7 +25,7 @@ from tdgc.ablate.table import Found, describe, rows
 from tdgc.ablate.trials import Runner, Tile, Trial, TrialError, uncalibrated
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
-from tdgc.errors import InputError, StoppedError
+from tdgc.errors import InputError, StoppedError, interruptible
 from tdgc.files import write_json, write_text
 from tdgc.learn.run import sole_user
 from tdgc.parallel.cores import workers_flag
@@ -231,6 +231,7 @@ def conduct(
     return found, True
 
 
+@interruptible("tdgc.ablate")
 def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     deadline = None if args.time_limit is None else time.monotonic() + args.time_limit

@@ -32,10 +32,10 @@ from tdgc.benchmark.diagnosis import (
 )
 from tdgc.benchmark.drivers import BaselineDriver, Decides, Driver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Cell, run_cell
-from tdgc.benchmark.results import STOPS
+from tdgc.benchmark.results import FAILURES
 from tdgc.benchmark.trace import Trace, Tracer
 from tdgc.config import HighLevelConfig, LowLevelConfig
-from tdgc.errors import what_stopped
+from tdgc.errors import interruptible, what_stopped
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX
 from tdgc.sim.geometry import read_geometry
@@ -183,6 +183,7 @@ def measured_limits(traces: Sequence[Trace], hips: float) -> Mapping[str, tuple[
     return {name: (highest(name, False), highest(name, True)) for name in LIMITS}
 
 
+@interruptible("tdgc.benchmark.planted")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.benchmark.planted",
@@ -201,7 +202,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     try:
         count_blames(low, low_config, pair, hips)
-    except STOPS as error:
+    except FAILURES as error:
         print(f"tdgc.benchmark.planted: {what_stopped(error)}", file=sys.stderr)
         return 1
     return 0

@@ -20,9 +20,9 @@ from tdgc.sim.terrain import EDITION
 #: Files written by ``write_results``.
 FILES = ("episodes.csv", "summary.json", "trajectories.npz")
 _FILMS = ("films/film_*", "films/sheet_*", "films/strip_*")
-#: What may stop an evaluation: Ctrl-C or SIGTERM, a robot that blows up, a full disk or memory, a
-#: dead process.
-STOPS = (KeyboardInterrupt, FloatingPointError, OSError, MemoryError, WorkerError)
+#: What may stop an evaluation besides Ctrl-C: a robot that blows up, a full disk or memory, a dead
+#: process.
+FAILURES = (FloatingPointError, OSError, MemoryError, WorkerError)
 #: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and
 #: the benchmark editions of the tiles and of the policies' training.
 PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
