@@ -46,6 +46,7 @@ from tdgc.sim.commands import (
     INDEX,
     NAMES,
     UNITS,
+    VELOCITIES,
     CommandDecoder,
     command_bounds,
     default_command,
@@ -59,7 +60,7 @@ from tdgc.sim.terrain import TileField, make_tile
 from tdgc.sim.urdf import JOINTS, mesh_path, read_urdf
 from tdgc.sim.world import World
 from tdgc.tasks.high_observation import SEMANTIC
-from tdgc.tasks.pairing import PRETRAINED, VELOCITIES, load_low
+from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.rules import GOAL_RADIUS, GOING, outcome
 

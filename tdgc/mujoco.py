@@ -89,7 +89,7 @@ class Deployed(Driver):
         loco.targets = np.concatenate([self._targets[None, None], loco.targets[:-1]])
         loco.world.step(loco.targets, loco.delay, loco.joint_offset)
         loco.clock.clock[:] = low["next_clock"]
-        loco.clock.update(commands[:, 12:], commands[:, INDEX["duration"]])
+        loco.update_clock()
 
 
 @functools.lru_cache(maxsize=1)

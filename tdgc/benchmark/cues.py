@@ -128,7 +128,7 @@ class CuesLaw:
         if self._landing is not None:
             self._leap(state, cue, bearing, before, self._landing)
         # The styles may exceed the command ranges that the low policy was trained on.
-        state.command = np.clip(state.command, self._decoder.low, self._decoder.high)
+        state.command = self._decoder.nearest(state.command)
         return self._decoder.encode(state.command), state
 
     def _look(self, memory: Memory, cue: dict[str, Array]) -> None:

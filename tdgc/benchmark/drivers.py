@@ -96,13 +96,12 @@ class BaselineDriver(Driver):
         distance, direction = to_goal(state, self._goal)
         speed, turn = toward(distance, wrap_angle(direction - state.yaw), self.top_speed)
         self._command[:, INDEX["vx"]], self._command[:, INDEX["yaw_rate"]] = speed, turn
-        low, high = self._decoder.low, self._decoder.high
-        return np.clip(self._command, low, high, out=self._command)
+        return self._decoder.nearest(self._command)
 
 
 class TeacherDriver(Driver):
-    """Drives robots by the scripted teacher, which decides every ``decimation`` control steps by
-    default.
+    """Drives robots by the scripted teacher, which decides as often as a high policy with default
+    settings.
 
     It is told what the hierarchy has to infer, so it is no competitor: it shows what the low policy
     can do under good commands.

@@ -37,7 +37,7 @@ from tdgc.benchmark.trace import Trace, Tracer
 from tdgc.config import HighLevelConfig, LowLevelConfig
 from tdgc.errors import interruptible, what_stopped
 from tdgc.policies import Policy
-from tdgc.sim.commands import INDEX
+from tdgc.sim.commands import INDEX, VELOCITIES
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import columns
@@ -131,7 +131,7 @@ FAULTS = (
         PlantedFault(
             f"bounds of {name} swapped", "decisions", functools.partial(SwappedBounds, command=name)
         )
-        for name in ("vx", "vy", "yaw_rate")
+        for name in VELOCITIES
     ),
     PlantedFault("a blindfolded high policy", "decisions", Blindfold),
 )

@@ -40,7 +40,7 @@ def make_room(out: Path, patterns: Sequence[str], folders: Mapping[str, bool]) -
     Args:
         out: the folder.
         patterns: of files beside ``FILES`` and films.
-        folders: of those that will be needed, by name, whether they are.
+        folders: name -> whether the new table needs it.
     """
     make_folder(out)
     for pattern in (*FILES, *_FILMS, *patterns):

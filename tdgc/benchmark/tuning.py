@@ -34,13 +34,11 @@ from tdgc.config import (
     with_overrides,
 )
 from tdgc.policies import Policy
-from tdgc.sim.commands import CONTINUOUS, INDEX, command_bounds
+from tdgc.sim.commands import CONTINUOUS, INDEX, VELOCITIES, command_bounds
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
-
-_VELOCITIES = ("vx", "vy", "yaw_rate")
 
 
 @dataclass(frozen=True)
@@ -174,7 +172,7 @@ def check(tuning: Tuning, config: HighLevelConfig, low: LowLevelConfig) -> None:
     for name, value in dataclasses.asdict(safety).items():
         if value is not None and not value > 0.0:
             raise ConfigError(f"safety.{name} must be positive, not {value}")
-        for command in _VELOCITIES:
+        for command in VELOCITIES:
             bottom, top = getattr(low.commands, command)
             if value is not None and not bottom <= 0.0 <= top:
                 raise ConfigError(
@@ -238,7 +236,7 @@ class TunedDriver(HierarchyDriver):
 
     def _slow_down(self, command: Array) -> None:
         """Apply the safety limits to commands (M, 15), in place."""
-        planar, turning = [INDEX["vx"], INDEX["vy"]], [INDEX[name] for name in _VELOCITIES]
+        planar, turning = [INDEX["vx"], INDEX["vy"]], [INDEX[name] for name in VELOCITIES]
         if self._safety.max_speed is not None:
             speed = np.linalg.norm(command[:, planar], axis=1, keepdims=True)
             command[:, planar] *= self._safety.max_speed / np.maximum(speed, self._safety.max_speed)

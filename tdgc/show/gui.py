@@ -13,7 +13,15 @@ from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import CONDITIONS, Batch, Cell, physics_of, run_cell, tile_of
 from tdgc.policies import Policy
 from tdgc.show.film import set_stage
-from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, CommandDecoder, default_command, gait_index
+from tdgc.sim.commands import (
+    CONTINUOUS,
+    INDEX,
+    UNITS,
+    VELOCITIES,
+    CommandDecoder,
+    default_command,
+    gait_index,
+)
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
@@ -39,7 +47,7 @@ def slider_command(values: Array) -> Array:
 def describe(command: Array) -> str:
     """Format the gait and velocities of a command (15,) for the text above the robot."""
     parts = [GAITS[int(gait_index(command))]]
-    parts += [f"{n} {command[INDEX[n]]:.2f} {UNITS[INDEX[n]]}" for n in ("vx", "vy", "yaw_rate")]
+    parts += [f"{n} {command[INDEX[n]]:.2f} {UNITS[INDEX[n]]}" for n in VELOCITIES]
     return ", ".join(parts)
 
 

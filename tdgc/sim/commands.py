@@ -35,6 +35,7 @@ UNITS = (
 )  # fmt: skip
 NUM_ACTIONS = len(CONTINUOUS) + 1  # 12 continuous ones and the gait channel
 NUM_COMMANDS = len(NAMES)
+VELOCITIES = ("vx", "vy", "yaw_rate")  # the first three
 #: Position of each command in the vector, by name.
 INDEX = {name: i for i, name in enumerate(NAMES)}
 #: Commands that change sign in a left-right mirror.

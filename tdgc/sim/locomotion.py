@@ -210,7 +210,7 @@ class Locomotion:
         self.actions[:, index] = 0.0
         self.targets[:, index] = self.nominal
         self.clock.reset(index, clock)
-        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
+        self.update_clock()
 
     def randomise(
         self,
@@ -303,15 +303,19 @@ class Locomotion:
         """
         fill(self._arrays(), state)
         self.world.state.derive()
-        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
+        self.update_clock()
         self.world.apply_dynamics(np.arange(self.num_robots))
         self.world.forget()
 
     def observe(self, noise: Noise | None = None) -> NDArray[np.float32]:
         """s^L = [g^b, dq, qdot, a_{t-1}, a_{t-2}, c, phi, g] and the rest of ``actor_layout``,
         (M, n); ``noise`` is added to measured terms."""
-        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
+        self.update_clock()
         return observe(self.layout, self, noise)
+
+    def update_clock(self) -> None:
+        """Recompute the phases of the feet after the command or the clock was set."""
+        self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
 
 
 def _joint_error(loco: Locomotion) -> Array:

@@ -236,7 +236,7 @@ def pd_torque(
     Args:
         error: (M, 12) target minus angle, rad.
         speed: (M, 12) joint speed, rad/s.
-        strength: (M, 1) motor strength, a factor on gains and torque limits.
+        strength: (M, 1) or (M, 12) motor strength, a factor on gains and torque limits.
         config: gains and limits.
         friction: (M, 1) N m, dry friction in each joint.
 

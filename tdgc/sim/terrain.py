@@ -80,8 +80,8 @@ PILLAR_DIAMETER = (0.2, 0.4)  # m
 PILLAR_HEIGHT = 0.8  # m
 PILLAR_CLEARANCE = 0.6  # m, minimum free space between any two
 
-# Clutter, which is ours. The ranges cover what robots of this size may meet; obstacles leave as
-# much free space as pillars.
+# Clutter is our own addition. Its ranges cover what robots of this size may meet; obstacles leave
+# as much free space as pillars.
 WAVES = 3  # number of plane waves that make up its hills
 WAVE_LENGTH = (1.0, 3.0)  # m
 WAVE_SLOPE = 3.0  # 1/m, steepest slope per step height: a slope of 0.45 at d = 1
@@ -94,7 +94,7 @@ WALL_LENGTH = (0.4, 1.2)  # m
 WALLS = (2, 6)  # least and greatest number
 WALL_THICKNESS = 0.2  # m
 
-# Ditches, ours as well. Even the shortest part has room for two trenches, or for four of Stair's
+# Ditches are, too. Even the shortest part has room for two trenches, or for four of Stair's
 # risers.
 SHORTEST_PART = 1.5  # m
 

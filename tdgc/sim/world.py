@@ -96,14 +96,14 @@ class World:
 
     Raises:
         ConfigError: the robot's URDF is missing, or not of a robot that this package can drive.
-        ValueError: ``field`` has not one row per robot.
+        ValueError: ``field`` has not one tile per robot.
 
     Attributes:
         state: the ``RobotState`` after the last step, push or reset.
         friction: (M,) coefficient of friction of all links.
         payload: (M,) kg, spread over the trunk.
         armature: (M,) kg m^2, rotor inertia of each joint, as in ``tdgc.sim.rotors``.
-        strength: (M, 1) motor strength, a factor on gains and torque limits.
+        strength: (M, 1) or (M, 12) motor strength, a factor on gains and torque limits.
         joint_friction: (M, 1) N m, dry friction in each joint.
         bullet_seconds: wall time spent inside Bullet's step so far.
     """

@@ -1,8 +1,8 @@
 """Trials of how fast the teacher should walk, step and leap with a low policy.
 
 What suits depends on the low policy. With the shipped one nothing is better than the usual speeds.
-One of the Unitree A1 falls on the higher stairs and between trenches at these, and needs faster
-walks with faster steps, and slower leaps (docs/experiments.md).
+At these the Unitree A1's falls on the higher stairs and between trenches; it needs faster walks
+with faster steps, and slower leaps (docs/experiments.md).
 """
 
 import dataclasses

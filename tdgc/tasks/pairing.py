@@ -8,14 +8,11 @@ import numpy as np
 from tdgc import policies
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, recorded
 from tdgc.policies import Policy
-from tdgc.sim.commands import CONTINUOUS, INDEX, NUM_COMMANDS, default_command
+from tdgc.sim.commands import CONTINUOUS, INDEX, NUM_COMMANDS, VELOCITIES, default_command
 from tdgc.sim.robot import NUM_JOINTS
 
 #: Folder of the shipped policies.
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
-
-#: What a high policy decides besides the gait when its ``behaviour`` is "velocities".
-VELOCITIES = ("vx", "vy", "yaw_rate")
 
 
 def at_default(ranges: CommandRanges) -> CommandRanges:

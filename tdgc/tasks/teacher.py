@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.config import CommandRanges, TeacherConfig
-from tdgc.sim.commands import INDEX, CommandDecoder, default_command
+from tdgc.sim.commands import INDEX, VELOCITIES, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
@@ -47,8 +47,7 @@ class Style:
         swing_height, stance_width, body_height: m.
         duration: duty factor.
         pitch: rad, nose down positive.
-        uphill: m/s, times the sine of a lateral slope: the velocity up that slope, against sliding
-            down.
+        uphill: m/s; times the sine of a lateral slope, the velocity up it, against sliding down.
     """
 
     speed: float
@@ -120,7 +119,7 @@ _SEEN = 0.5  # weight of a newly seen speed in the estimate: it oscillates withi
 _RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)
 _APART = 0.9  # rad, least angle between two ways whose mean would lead into the obstacle
 #: Commands in which the two ways around an obstacle differ.
-WAY = [INDEX[name] for name in ("vx", "vy", "yaw_rate")]
+WAY = [INDEX[name] for name in VELOCITIES]
 
 
 _DISTANCE_GAIN = 1.0  # 1/s: a robot slows down where it could arrive within a second

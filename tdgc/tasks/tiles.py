@@ -47,7 +47,7 @@ def check_families(families: Sequence[str]) -> None:
 
 
 def check_levels(levels: int) -> None:
-    """Check that there are that many levels to train on.
+    """Check that training uses no level that is kept for evaluation.
 
     Raises:
         ValueError: too many levels; the benchmark reserves those above as terrain that no policy
