@@ -60,7 +60,8 @@ from tdgc.tasks.teacher import Skill
 from tdgc.tasks.tiles import check_families, check_levels, left_out
 
 # Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
-# the apprentice alone drives, so that it learns in the states to which its own actions lead.
+# the apprentice alone drives, so that it learns in the states to which its own actions lead. Chosen
+# by hand.
 _LED = 0.75
 #: Where train_low.py writes its policy by default.
 TRAINED_LOW = Path("runs/low/policy")

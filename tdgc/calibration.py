@@ -39,18 +39,22 @@ from tdgc.sim.robot import Array
 from tdgc.tasks.pairing import load_low, mdp_of
 from tdgc.tasks.rules import is_fallen
 
-#: Fewer robots whose walking is measured say nothing about the commands.
+#: Fewer robots whose walking is measured, 16 with each gait, say nothing about 12 commands.
 LEAST_ROBOTS = 64
 _LEAST_WALKED = 8  # of them: four are held out to measure the networks' error
 _STREAM = 3  # of random numbers; training and evaluation have others (``tdgc.sim.terrain``)
-_BATCH = 400  # robots that walk at the same time
-_WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2  # the mean is over the rest
-_MEASURED = 1.4  # factor on the velocity ranges; commands are corrected up to ``correction.LIMIT``
+_BATCH = 400  # robots that walk at the same time: the default number gives work to twelve cores
+# The mean is over the rest, four cycles or more; the velocity settles within a second.
+_WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2
+# Factor on the velocity ranges. Commands are corrected up to ``correction.LIMIT``, 1.2, and nothing
+# is known beyond what was measured.
+_MEASURED = 1.4
 # Weight of the squared change of a command in the correction's loss: where the robot cannot go
-# faster, asking for more must not pay.
+# faster, asking for more must not pay. Chosen by hand.
 _PULL = 0.1
 # With one network instead of three, pace became worse: for commands that robots cannot follow its
-# predictions were arbitrary, and nothing revealed it. The variance of three networks does.
+# predictions were arbitrary, and nothing revealed it. The variance of three networks does. What was
+# tried is in docs/experiments.md; the other numbers were chosen by hand.
 _NETWORKS, _HIDDEN, _EPOCHS, _MINIBATCH = 3, (256, 128), 300, 256
 _CORRECTIONS, _COMMANDS = 3000, 1024  # minibatches that the correction learns from, and their size
 _WALKING, _FITTED = 0.6, 0.8  # approximate progress after walking and after fitting

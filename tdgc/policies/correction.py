@@ -8,7 +8,8 @@ from torch import nn
 from tdgc.policies.files import PolicyFileError
 
 #: Velocities are corrected up to this share of their ranges, measured from the middle. The policy
-#: was not trained outside the ranges, and what it does far outside is of little use.
+#: was not trained outside the ranges, and what it does far outside is of little use. Chosen by
+#: hand.
 LIMIT = 1.2
 
 

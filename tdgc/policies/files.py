@@ -54,6 +54,8 @@ LSTM_TENSORS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
 _deserialize: Callable[[bytes], list[tuple[str, dict[str, Any]]]] = safetensors.deserialize
 
+# Limits on what is read from a file that may be damaged: far above any policy of this package, and
+# far below what fills a computer's memory.
 _MAX_JSON_BYTES = 4 * 2**20
 _MAX_WEIGHT_BYTES = 256 * 2**20
 _MAX_SIZE = 65536  # of any layer, observation or action

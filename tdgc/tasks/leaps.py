@@ -35,14 +35,18 @@ STRIDE = 0.39  # m, preferred stride of a leap: with longer ones robots trip at 
 #: them, and then in shorter ones too; one trained on strides up to 0.5 m did not. With landings
 #: 1 cm off, 29 of 30 tiles of level 10 can be crossed with this limit, and 20 with 0.45 m.
 LONGEST = 0.48
-BEYOND = 0.5  # m behind the last trench, at which leaping ends
-HEADING_GAIN = 1.5  # 1/s, yaw rate per rad of heading error, in a walk as in a leap
+# m behind the last trench, at which leaping ends: the rear feet, 0.38 m behind the front ones, are
+# across, too.
+BEYOND = 0.5
+# 1/s, yaw rate per rad of heading error, in a walk as in a leap; chosen by hand.
+HEADING_GAIN = 1.5
 _STEP = 0.01  # m, grid spacing of a plan
 _STRIDES = np.arange(28, 47, 2)  # in units of _STEP: strides at 0.95 SPEED and 2.5 to 4 Hz
 #: m from a trench's edge (its lip), beyond which a foot is safe. Of 40 robots that were told where
 #: the trenches are, 3, 15 and 28 crossed level 10 with 0.12, 0.08 and 0.05 m.
 CLEAR = 0.05
-_FALL = 4.0  # price of a foot in a trench; a foot on the lip costs 1
+# Prices, chosen by hand: a foot in a trench must cost more than any other choice.
+_FALL = 4.0  # a foot in a trench; a foot on the lip costs 1
 _STRIDE_PRICE = 10.0  # 1/m^2, for the squared difference of a stride from STRIDE
 _LENGTH_PRICE = 2.0  # 1/m^2, for the squared distance of rear feet from where the front stood
 # A stride can be changed until this share of its cycle. After that the legs push off, and a change
@@ -53,7 +57,9 @@ _LENGTH_PRICE = 2.0  # 1/m^2, for the squared distance of rear feet from where t
 _DECIDED, _CHANGE_PRICE = 0.4, 0.5
 #: Commands that decide on the next stride: step frequency and stance length.
 STRIDE_COMMANDS = [INDEX["frequency"], INDEX["stance_length"]]
-FREQUENCIES, LENGTHS = 25, 11  # how many are tried at each decision, evenly over the command ranges
+# How many are tried at each decision, evenly over the command ranges. Neighbours move a landing by
+# about a centimetre, the grid spacing of a plan.
+FREQUENCIES, LENGTHS = 25, 11
 # How leaping robots speed up, from two low policies: 0.8, 1.1 and 1.2 m/s at the first landings
 # from rest, and 1.14 m/s in the long run when 1.2 is commanded. Without this model, landings at a
 # trench right behind the start were misjudged by 7 cm.
@@ -315,8 +321,10 @@ def steer_leap(
 
 
 _ROBOTS = 16  # number of robots in a measurement, which repeats to a few millimetres
-_SECONDS, _SETTLE = 6.0, 1.5  # s, duration of the measurement, and of speeding up within it
-_STANDING = 0.5  # least share of robots still up after the measurement if the policy can leap
+# s, duration of the measurement, and of speeding up within it: five times ``_RISE``.
+_SECONDS, _SETTLE = 6.0, 1.5
+# Least share of robots still up after the measurement if the policy can leap: most.
+_STANDING = 0.5
 _RATE = 0.02  # weight of a landing: after 180 of them 3 % of the initial estimate is left
 
 

@@ -115,8 +115,9 @@ class Skill:
 #: m ahead at which the probes see a trench; they reach 1.2 m.
 SIGHT = 1.15
 
-_SEEN = 0.5  # weight of a newly seen speed in the estimate: it oscillates within a gait cycle
-_RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)
+# Weight of a newly seen speed in the estimate, chosen by hand: it oscillates within a gait cycle.
+_SEEN = 0.5
+_RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)  # directions that are compared, 15 degrees
 _APART = 0.9  # rad, least angle between two ways whose mean would lead into the obstacle
 #: Commands in which the two ways around an obstacle differ.
 WAY = [INDEX[name] for name in VELOCITIES]
