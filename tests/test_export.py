@@ -380,7 +380,7 @@ def without_sources(table: dict[str, Any]) -> None:
         ("low", lambda t: t["rate"].update(value=25.0), "25 Hz, which is not 5 times"),
         ("low", lambda t: t["start"].update(joint_angles=TURNED), "the start pose differs"),
         ("low", lambda t: t["start"]["trunk_height"].update(value=0.31), "m high"),
-        ("low", without_sources, "low: nothing gives its input 'commands'"),
+        ("low", without_sources, "low: the reading 'commands' is missing"),
         ("high", without_sources, ""),
         ("high", lambda t: t["order"].reverse(), "order["),
         ("high", lambda t: t["order"][0].update(every=4), "which is not 4 times"),

@@ -137,8 +137,9 @@ def test_decisions_are_those_of_the_policy_and_what_they_decode_to(watched):
 def test_commands_at_their_bounds_are_marked(low):
     class Extreme(BaselineDriver):
         def command(self, step: int) -> Array:
-            super().command(step)[:, [INDEX["vx"], INDEX["vy"]]] = 1.2, -0.6
-            return self._command
+            command = super().command(step)
+            command[:, [INDEX["vx"], INDEX["vy"]]] = 1.2, -0.6
+            return command
 
     _, (t,), _ = watch(Extreme(), Cell("gp", "nominal", "rough", 0, 0, 1), low[0])
     marked = {name: set(t[f"at_bound_{name}"][:-1].tolist()) for name in CONTINUOUS}
