@@ -44,7 +44,8 @@ LEAST_ROBOTS = 64
 _LEAST_WALKED = 8  # of them: four are held out to measure the networks' error
 _STREAM = 3  # of random numbers; training and evaluation have others (``tdgc.sim.terrain``)
 _BATCH = 400  # robots that walk at the same time: the default number gives work to twelve cores
-# The mean is over the rest, four cycles or more; the velocity settles within a second.
+# The mean is over the rest, four cycles or more. Robots speed up within four times 0.3 s, see
+# ``tdgc.tasks.leaps``.
 _WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2
 # Factor on the velocity ranges. Commands are corrected up to ``correction.LIMIT``, 1.2, and nothing
 # is known beyond what was measured.

@@ -21,7 +21,7 @@ from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.rules import is_fallen
 
-# Chosen by hand, and kept since the first table, so that numbers stay comparable.
+# Chosen by hand; tables of different durations would not be comparable.
 _TRACKING_SECONDS = 10.0  # length of a tracking episode, which has one command
 _SETTLE_SECONDS = 1.0  # not scored, because robots accelerate from rest
 _SWITCH_SECONDS = 2.0  # between gait changes in the fall test
