@@ -38,8 +38,9 @@ from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy
 from tdgc.show import film, gui, plots, report
+from tdgc.sim.bullet_world import BulletWorld
+from tdgc.sim.display import WindowError
 from tdgc.sim.geometry import read_geometry
-from tdgc.sim.world import WindowError, World
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.manners import find_manner, manner_of
 from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of
@@ -450,7 +451,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         evaluation = Evaluation.of(parse(arguments))
         low, config = load_low(evaluation.low)
-        World(1, config.robot, config.physics).close()  # fail before earlier results are removed
+        # Fail before earlier results are removed.
+        BulletWorld(1, config.robot, config.physics).close()
         drivers = evaluation.drivers(low, config)
         evaluation.make_room()
     except (ValueError, OSError) as error:

@@ -41,6 +41,7 @@ from tdgc.deploy.interface import VERSION, Table, interface_path
 from tdgc.errors import interruptible, require
 from tdgc.files import checksum, write_text
 from tdgc.policies import Policy
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import (
     CONTINUOUS,
     INDEX,
@@ -58,7 +59,6 @@ from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
 from tdgc.sim.terrain import TileField, make_tile
 from tdgc.sim.urdf import JOINTS, mesh_path, read_urdf
-from tdgc.sim.world import World
 from tdgc.tasks.high_observation import SEMANTIC
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
@@ -464,8 +464,7 @@ def _stage(pair: Pair, controller: Controller) -> tuple[Locomotion, Array, Array
     tile = make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0))
     config, field = pair.low_config, TileField.of(tile)
     physics = dataclasses.replace(config.physics, control_dt=controller.dt)
-    world = World(1, controller.robot(), physics, field)
-    loco = Locomotion(1, config.robot, config.physics, field, config.gyro, world=world)
+    loco = Locomotion(BulletWorld(1, controller.robot(), physics, field), config)
     loco.correct = pair.low.correct
     return loco, field.starts, field.goals
 

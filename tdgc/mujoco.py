@@ -30,11 +30,11 @@ from tdgc.files import write_json
 from tdgc.parallel.jobs import run_jobs
 from tdgc.show import film
 from tdgc.sim.commands import INDEX
+from tdgc.sim.display import WindowError
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TileField
-from tdgc.sim.world import WindowError
 from tdgc.tasks.rules import HORIZON
 
 if TYPE_CHECKING:

@@ -30,8 +30,8 @@ from tdgc.benchmark.evaluation import (
     Batch,
     Cell,
     EpisodeLog,
+    benchmarked,
     complete,
-    physics_of,
     plan,
     push_velocities,
     run_cell,
@@ -52,13 +52,13 @@ from tdgc.errors import InputError
 from tdgc.parallel import cluster
 from tdgc.parallel.worker import WorkerError
 from tdgc.show import gui
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import default_command
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import EDITION
 from tdgc.sim.urdf import urdf_path
-from tdgc.sim.world import World
 from tdgc.tasks import manners
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of
@@ -143,19 +143,19 @@ def test_conditions_are_the_benchmarks():
 
 def test_physics_at_1000_hz_keeps_the_control_rate(low):
     config = mdp_of(low)
-    fast = physics_of(config, CONDITIONS["physics-1000hz"])
+    fast = benchmarked(config, CONDITIONS["physics-1000hz"]).physics
     assert fast.substeps == 20 and fast.dt == pytest.approx(0.001)
-    assert physics_of(config, CONDITIONS["nominal"]) == PhysicsConfig()
+    assert benchmarked(config, CONDITIONS["nominal"]).physics == PhysicsConfig()
 
 
 def test_physics_is_the_benchmarks_whatever_a_policy_was_trained_in() -> None:
     easy = PhysicsConfig(control_dt=0.04, substeps=8, hold=1, friction=1.2, solver_iterations=50)
-    found = physics_of(LowLevelConfig(physics=easy), CONDITIONS["nominal"])
+    found = benchmarked(LowLevelConfig(physics=easy), CONDITIONS["nominal"]).physics
     assert found == PhysicsConfig(control_dt=0.04, substeps=16)
     assert (found.dt, found.friction, found.hold) == (0.0025, 0.8, 2)
     # A control step that is no multiple of the joint control's gets a finer physics step.
     odd = PhysicsConfig(control_dt=0.0125, substeps=6)
-    found = physics_of(LowLevelConfig(physics=odd), CONDITIONS["nominal"])
+    found = benchmarked(LowLevelConfig(physics=odd), CONDITIONS["nominal"]).physics
     assert (found.joint_steps, found.dt) == (3, pytest.approx(0.0125 / 6))
 
 
@@ -712,13 +712,13 @@ def test_a_condition_reaches_the_robots(name, friction, payload, delay, armature
 
 def test_robots_are_pushed_every_three_seconds(monkeypatch):
     monkeypatch.setattr(evaluation, "HORIZON", 6.2)
-    driver, pushes, push = Stand(), [], World.push
+    driver, pushes, push = Stand(), [], BulletWorld.push
 
     def note(world, index, velocity):
         pushes.append((len(driver.steps), np.array(index), np.array(velocity)))
         push(world, index, velocity)
 
-    monkeypatch.setattr(World, "push", note)
+    monkeypatch.setattr(BulletWorld, "push", note)
     cell = Cell("gp", "pushes", "rough", 0, 0, 2)
     run_cell(cell, load_low(PRETRAINED / "low")[0], driver, 5)
     drawn = push_velocities(cell, 5, 0.75, 3)

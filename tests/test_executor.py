@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tdgc.config import RandomisationConfig
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.sensors import EpisodeDraws, Noise
@@ -20,7 +21,7 @@ LOW, CONFIG = load_low(PRETRAINED / "low")
 @pytest.fixture
 def robots() -> Iterator[list[Locomotion]]:
     """Three worlds of three robots each, which all stand in the same pose."""
-    made = [Locomotion(3, CONFIG.robot, CONFIG.physics, None, CONFIG.gyro) for _ in range(3)]
+    made = [Locomotion(BulletWorld(3, CONFIG.robot, CONFIG.physics), CONFIG) for _ in range(3)]
     for loco in made:
         xy = np.array([[0.0, 0.0], [0.0, 3.0], [0.0, 6.0]])
         loco.place(np.arange(3), xy, np.zeros(3), np.zeros(3))

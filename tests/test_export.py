@@ -26,6 +26,7 @@ from tdgc.export import TOLERANCE
 from tdgc.files import checksum
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.policies import AsymmetricActorCriticPolicy, Correction, Policy
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import NAMES, SIDEWAYS, CommandDecoder, default_command
 from tdgc.sim.gaits import GAIT_TABLE, PhaseClock, gait_embedding
 from tdgc.sim.locomotion import Locomotion, actor_layout
@@ -181,7 +182,7 @@ def test_low_level_is_the_executors_step(
     policy = random_low(tmp_path / "low", config, symmetric)
     graph = LowGraph(policy, config)
     m, rng = 24, np.random.default_rng(0)
-    loco = Locomotion(m, config.robot, config.physics, None, gyro)
+    loco = Locomotion(BulletWorld(m, config.robot, config.physics), config)
     try:
         disturb(loco, rng)
         before = loco.command.copy()

@@ -15,6 +15,7 @@ import evaluate
 import train_low
 from tdgc.config import ConfigError, LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.deploy import graphs
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import PhaseClock, foot_phases, swing_profile
 from tdgc.sim.geometry import FRONT, SIDE, read_geometry
@@ -28,7 +29,6 @@ from tdgc.sim.robot import (
     walking_pose,
 )
 from tdgc.sim.urdf import JOINTS, merged_file, read_urdf, urdf_path
-from tdgc.sim.world import World
 from tdgc.tasks import low_rewards as rewards
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.pairing import PRETRAINED
@@ -219,7 +219,7 @@ def test_names_of_links_and_order_do_not_matter(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ another robot in all modules
 
 
-def feet_by_bullet(world: World) -> np.ndarray:
+def feet_by_bullet(world: BulletWorld) -> np.ndarray:
     """Foot positions of robot 0, from Bullet's poses of its calves, (4, 3) m."""
     body, client = world._bodies[0], world._client_of[0]
     feet = []
@@ -236,7 +236,7 @@ def test_kinematics_of_another_robot_are_bullets(
 ) -> None:
     """Foot positions agree with Bullet's in any attitude, before and after a step."""
     config = request.getfixturevalue(which)
-    world, rng = World(1, config, PhysicsConfig()), np.random.default_rng(0)
+    world, rng = BulletWorld(1, config, PhysicsConfig()), np.random.default_rng(0)
     nothing = np.zeros(1), np.zeros((1, 12))
     try:
         for _ in range(5):
@@ -254,7 +254,7 @@ def test_trunk_that_turns_about_its_frame(tmp_path: Path) -> None:
     """The frame rests; the centre of mass, 2 cm ahead, moves left at 2 rad/s x 2 cm = 0.04 m/s."""
     trunk = '<origin xyz="0 0 0" rpy="0 0 0"/>\n      <mass value="5.6"/>'
     config = changed(tmp_path, (trunk, trunk.replace("0 0 0", "0.02 0 0", 1)))
-    world = World(1, config, PhysicsConfig())
+    world = BulletWorld(1, config, PhysicsConfig())
     state, client, body = world.state, world._client_of[0], world._bodies[0]
     world.reset_robots([0], np.array([[1.0, 2.0, 3.0]]), UPRIGHT, nominal_pose(config)[None])
     state.ang_vel[0, 2] = 2.0
@@ -271,7 +271,7 @@ def test_trunk_that_turns_about_its_frame(tmp_path: Path) -> None:
 
 def test_trunk_with_turned_inertia(a1: RobotConfig) -> None:
     """Pose and velocities are read back as set, though the principal axes differ from the frame."""
-    world = World(1, a1, PhysicsConfig())
+    world = BulletWorld(1, a1, PhysicsConfig())
     state, client, body = world.state, world._client_of[0], world._bodies[0]
     quaternion = np.array([pybullet.getQuaternionFromEuler([0.3, -0.5, 1.0])])
     world.reset_robots([0], np.array([[1.0, 2.0, 3.0]]), quaternion, nominal_pose(a1)[None])
@@ -312,7 +312,7 @@ def test_what_is_fixed_to_the_trunk_is_its_own(tmp_path: Path) -> None:
         '<origin xyz="0 0 -0.3"/><geometry><sphere radius="0.1"/></geometry></collision></link>'
     )
     config = changed(tmp_path, ("</robot>", f"{keel}</robot>"))
-    world = World(1, config, PhysicsConfig())
+    world = BulletWorld(1, config, PhysicsConfig())
     pose = nominal_pose(config)[None]
     world.reset_robots([0], np.array([[0.0, 0.0, 0.41]]), UPRIGHT, pose)
     for _ in range(10):
@@ -419,7 +419,7 @@ def test_rotor_inertia_is_about_the_joint_in_any_inertial_frame(tmp_path: Path) 
     turned = changed(tmp_path, (level, level.replace('rpy="0 0 0"', 'rpy="0 0 1.5707963"')))
     swung = []
     for config in (RobotConfig(), turned):
-        world = World(1, config, PhysicsConfig())
+        world = BulletWorld(1, config, PhysicsConfig())
         world.reset_robots([0], np.array([[0.0, 0.0, 2.0]]), UPRIGHT, nominal_pose(config)[None])
         world.armature[0] = 0.02
         world.apply_dynamics([0])
@@ -434,8 +434,8 @@ def test_nominal_pose_beyond_the_joint_limits(tmp_path: Path) -> None:
     config = changed(tmp_path, ('lower="-2.82" upper="-0.89"', 'lower="-1.2" upper="-0.89"'))
     said = r"robot\.nominal_calf puts FL_calf_joint at -1\.5 rad; .*urdf allows -1\.2 to -0\.89$"
     with pytest.raises(ConfigError, match=said):
-        World(1, config, PhysicsConfig())
-    World(1, dataclasses.replace(config, nominal_calf=-1.0), PhysicsConfig()).close()
+        BulletWorld(1, config, PhysicsConfig())
+    BulletWorld(1, dataclasses.replace(config, nominal_calf=-1.0), PhysicsConfig()).close()
 
 
 def test_leg_angles_of_another_robot(robot: RobotConfig) -> None:
@@ -449,7 +449,7 @@ def test_leg_angles_of_another_robot(robot: RobotConfig) -> None:
 
 
 def test_payload_is_on_top_of_its_own_trunk(robot: RobotConfig) -> None:
-    world = World(1, robot, PhysicsConfig())
+    world = BulletWorld(1, robot, PhysicsConfig())
     world.payload[0] = 2.1
     world.apply_dynamics([0])
     mass, _, inertia, *_ = world._client_of[0].getDynamicsInfo(world._bodies[0], -1)
@@ -646,7 +646,7 @@ def test_a_urdf_that_does_not_fit(tmp_path: Path, old: str, new: str, message: s
         read_geometry(RobotConfig(urdf=str(path)))
     assert "\n" not in str(caught.value)
     with pytest.raises(ConfigError, match=message):
-        World(1, RobotConfig(urdf=str(path)), PhysicsConfig())
+        BulletWorld(1, RobotConfig(urdf=str(path)), PhysicsConfig())
 
 
 def test_one_leg_with_another_foot(tmp_path: Path) -> None:
@@ -674,7 +674,7 @@ def test_a_urdf_that_bullet_cannot_load(tmp_path: Path) -> None:
     box, mesh = '<box size="0.42 0.15 0.11"/>', '<mesh filename="nothing.stl"/>'
     path.write_text(SHIPPED.replace(box, mesh), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"mesh\.urdf: Bullet cannot load it, see above$"):
-        World(1, RobotConfig(urdf=str(path)), PhysicsConfig())
+        BulletWorld(1, RobotConfig(urdf=str(path)), PhysicsConfig())
 
 
 def test_scripts_refuse_it_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

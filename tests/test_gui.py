@@ -11,8 +11,8 @@ import evaluate
 from tdgc.config import ConfigError
 from tdgc.show.gui import describe, slider_command
 from tdgc.sim.commands import INDEX, default_command
+from tdgc.sim.display import WindowError, check_display
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
-from tdgc.sim.world import WindowError, check_display
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
 

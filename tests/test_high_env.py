@@ -21,6 +21,7 @@ from tdgc.config import (
     RobotConfig,
     with_overrides,
 )
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import NAMES, CommandDecoder, default_command, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import JOINT_FLIP, columns, width
@@ -270,9 +271,8 @@ def test_probes_see_what_is_ahead(task):
 def test_sensors_are_noisy_in_training_only(training):
     """Noise is added to the low policy's observation and to the probes, in training only."""
     task = NavigationTask(CONFIG, LOW_POLICY, 5, seed=3, training=training)
-    exact = Locomotion(
-        5, task.low_config.robot, task.low_config.physics, task.field, task.low_config.gyro
-    )
+    robot, physics = task.low_config.robot, task.low_config.physics
+    exact = Locomotion(BulletWorld(5, robot, physics, task.field), task.low_config)
     try:
         task.reset(np.arange(5))
         loco = task.locomotion

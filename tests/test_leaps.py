@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tdgc.config import CommandRanges
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
@@ -224,7 +225,8 @@ class Flail:
 
 def test_a_robot_that_blew_up_teaches_no_landing() -> None:
     _, config = load_low(PRETRAINED / "low")
-    loco, landings = Locomotion(2, config.robot, config.physics, None, config.gyro), []
+    world, landings = BulletWorld(2, config.robot, config.physics), []
+    loco = Locomotion(world, config)
     for blown, rows in ((None, [1]), (np.nan, [0, 1]), (1e4, [0, 1])):
         loco.place(np.arange(2), np.zeros((2, 2)), np.zeros(2), np.full(2, 0.3))
         loco.command[:, INDEX["frequency"]] = 2.0

@@ -9,6 +9,7 @@ import pybullet
 import pytest
 
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, observed_command
 from tdgc.sim.gaits import GAITS, foot_phases, gait_embedding
 from tdgc.sim.locomotion import GYRO_SCALE, SPEED_SCALE, Locomotion, actor_layout
@@ -32,7 +33,8 @@ ACTOR = columns(actor_layout(ROBOT, gyro=True))
 
 
 def standing(num: int = 1, gyro: bool = False, physics: PhysicsConfig = PHYSICS) -> Locomotion:
-    loco = Locomotion(num, ROBOT, physics, None, gyro)
+    config = LowLevelConfig(robot=ROBOT, physics=physics, gyro=gyro)
+    loco = Locomotion(BulletWorld(num, ROBOT, physics), config)
     index = np.arange(num)
     loco.place(index, np.zeros((num, 2)), np.zeros(num), np.zeros(num))
     return loco
@@ -457,7 +459,8 @@ def test_the_critic_sees_a_mirrored_terrain() -> None:
 def test_latency_is_kept_at_a_faster_control_rate() -> None:
     """30 ms are three control steps at 100 Hz, longer than the history at 50 Hz."""
     physics = PhysicsConfig(control_dt=0.01, substeps=4)
-    loco = Locomotion(1, RobotConfig(), physics, None)
+    config = LowLevelConfig(physics=physics)
+    loco = Locomotion(BulletWorld(1, config.robot, physics), config)
     assert loco.targets.shape == (5, 1, 12)
     loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
     loco.delay[:] = 0.03
@@ -472,7 +475,7 @@ def test_latency_is_kept_at_a_faster_control_rate() -> None:
 
 def test_phases_follow_the_clock_of_a_placed_robot() -> None:
     """``place`` updates the phases, so the high policy's first observation shows the new clock."""
-    loco = Locomotion(2, RobotConfig(), PhysicsConfig(), None)
+    loco = Locomotion(BulletWorld(2, RobotConfig(), PhysicsConfig()), LowLevelConfig())
     loco.place(np.arange(2), np.array([[0.0, 0.0], [5.0, 0.0]]), np.zeros(2), np.array([0.1, 0.35]))
     # Trot with a duty factor of one half: FL and RR half a cycle ahead of FR and RL.
     np.testing.assert_allclose(
@@ -491,7 +494,8 @@ def test_feet_rise_without_a_policy_only_where_the_pose_carries_the_robot(
 
     The command is a trot at 2.5 Hz with a swing height of 8 cm; its first cycle is not counted.
     """
-    made = Locomotion(1, dataclasses.replace(ROBOT, commanded_gait=walks), PHYSICS, None)
+    robot = dataclasses.replace(ROBOT, commanded_gait=walks)
+    made = Locomotion(BulletWorld(1, robot, PHYSICS), LowLevelConfig(robot=robot, physics=PHYSICS))
     made.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
     made.command[:, INDEX["frequency"]] = 2.5
     risen = []

@@ -185,6 +185,22 @@ def test_joint_friction_stops_a_swinging_leg() -> None:
     assert speeds[0] > 2.0 and speeds[1] < 0.7 * speeds[0]
 
 
+def test_what_follows_depends_on_the_state_alone_once_contacts_are_forgotten() -> None:
+    """As in Bullet, a world with a copied state then moves as the original does, bit for bit."""
+    original, copy = make_world("rough", 8), make_world("rough", 8)
+    place(original, height=0.2)
+    hold(original, 0.5)
+    for term in ("position", "quaternion", "lin_vel", "ang_vel", "q", "qd"):
+        getattr(copy.state, term)[:] = getattr(original.state, term)
+    moved = []
+    for world in (original, copy):
+        world.forget()
+        hold(world, 0.2)
+        moved.append([world.state.position, world.state.q, world.state.foot_force])
+    np.testing.assert_array_equal(np.concatenate(moved[0], 1), np.concatenate(moved[1], 1))
+    assert original.state.foot_force.sum() > 0.5 * WEIGHT
+
+
 def test_a_simulation_that_diverges_does_not_start_again() -> None:
     world = make_world()
     place(world)

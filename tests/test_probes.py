@@ -7,7 +7,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tdgc.config import HighLevelConfig, PhysicsConfig, RandomisationConfig, RobotConfig
+from tdgc.config import (
+    HighLevelConfig,
+    LowLevelConfig,
+    PhysicsConfig,
+    RandomisationConfig,
+    RobotConfig,
+)
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TileField, make_tile
@@ -29,7 +36,7 @@ def loco() -> Iterator[Locomotion]:
     field = TileField(ROBOTS)
     for k in range(ROBOTS):
         field.place(k, make_tile("gap", 1.0, np.random.default_rng(k)))
-    loco = Locomotion(ROBOTS, RobotConfig(), PhysicsConfig(), field)
+    loco = Locomotion(BulletWorld(ROBOTS, RobotConfig(), PhysicsConfig(), field), LowLevelConfig())
     rows = np.arange(ROBOTS)
     lips = np.array([field.features[k].trenches[0, 0] for k in range(ROBOTS)])
     xy = field.origin(rows) + np.column_stack([lips - 0.6, np.full(ROBOTS, 4.0)])

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
 from tdgc.sim.rotors import excess_momentum
 from tdgc.sim.terrain import TileField
 from tdgc.sim.urdf import urdf_path
-from tdgc.sim.world import World
 
 ROBOT = RobotConfig()
 NOMINAL = nominal_pose(ROBOT)
@@ -51,14 +51,14 @@ def test_momentum_is_the_derivative_of_the_excess_energy() -> None:
 
 def bullet(
     physics: PhysicsConfig, armature: float, payload: float = 0.0, robot: RobotConfig = ROBOT
-) -> World:
-    world = World(1, robot, physics)
+) -> BulletWorld:
+    world = BulletWorld(1, robot, physics)
     world.payload[0], world.armature[0] = payload, armature
     world.apply_dynamics([0])
     return world
 
 
-def flight(world: World) -> Array:
+def flight(world: BulletWorld) -> Array:
     """Move all joints at random in the air: joint speeds and the trunk's rates, (12, 15) rad/s."""
     rng = np.random.default_rng(0)
     world.reset_robots([0], np.array([[2.0, 2.0, 3.0]]), yaw_quaternion(np.zeros(1)), NOMINAL[None])

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.terrain import TileField, make_tile
 from tdgc.tasks import rules
@@ -20,7 +21,7 @@ def loco() -> Iterator[Locomotion]:
     field = TileField(5)
     for k in range(5):
         field.place(k, make_tile("tilt", 0.0, np.random.default_rng(k)))
-    loco = Locomotion(5, RobotConfig(), PhysicsConfig(), field)
+    loco = Locomotion(BulletWorld(5, RobotConfig(), PhysicsConfig(), field), LowLevelConfig())
     xy = field.origin(np.arange(5)) + [4.0, 4.0]
     loco.place(np.arange(5), xy, np.zeros(5), np.zeros(5))
     yield loco
@@ -70,7 +71,7 @@ def test_who_falls_into_the_goal_has_fallen(loco: Locomotion) -> None:
 
 
 def test_a_plane_has_no_tile_to_leave() -> None:
-    loco = Locomotion(1, RobotConfig(), PhysicsConfig(), None)
+    loco = Locomotion(BulletWorld(1, RobotConfig(), PhysicsConfig()), LowLevelConfig())
     loco.place(np.arange(1), np.array([[-50.0, 90.0]]), np.zeros(1), np.zeros(1))
     assert names(outcome(loco.world)) == ["going"]
     loco.world.close()

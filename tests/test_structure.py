@@ -148,7 +148,7 @@ def test_importing_the_package_is_light() -> None:
 
 
 def test_each_simulator_and_ray_have_one_door() -> None:
-    assert importers("pybullet") == {"sim.world"}
+    assert importers("pybullet") == {"sim.bullet_world"}
     assert importers("mujoco") == {"sim.mujoco_world"}
     assert importers("ray") == {"parallel.cluster"}
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tdgc.config import CommandRanges, PhysicsConfig, RobotConfig, TeacherConfig
+from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, RobotConfig, TeacherConfig
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.terrain import CELL, Tile, TileField, make_tile
@@ -40,7 +41,9 @@ class Course:
             tile = make_tile(kind, level / 10, rng) if isinstance(kind, str) else ground(kind)
             self.field.place(k, tile)
         self.origin = self.field.origin(np.arange(len(grounds)))
-        self.loco = Locomotion(len(grounds), RobotConfig(), PhysicsConfig(), self.field)
+        self.loco = Locomotion(
+            BulletWorld(len(grounds), RobotConfig(), PhysicsConfig(), self.field), LowLevelConfig()
+        )
         self.goal = self.origin + [7.25, 4.0]
         self.expects = np.array([family == "gap" for family in grounds])
         self.lead(Landing())

@@ -28,6 +28,7 @@ from tdgc.benchmark.tuning import (
     tuned_ranges,
 )
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
@@ -53,7 +54,7 @@ def pair(low, tmp_path_factory: pytest.TempPathFactory):
 def loco(low):
     """Twenty robots, each with its own heading and pose, so that each gets its own commands."""
     m = 20
-    robots = Locomotion(m, low[1].robot, low[1].physics, None)
+    robots = Locomotion(BulletWorld(m, low[1].robot, low[1].physics), low[1])
     rng = np.random.default_rng(0)
     robots.place(np.arange(m), np.zeros((m, 2)), rng.uniform(-3.0, 3.0, m), rng.uniform(size=m))
     robots.world.state.q += rng.normal(scale=0.5, size=(m, 12))

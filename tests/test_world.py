@@ -13,7 +13,8 @@ import numpy as np
 import pybullet
 import pytest
 
-from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
+from tdgc.sim.bullet_world import CLIENT_ROBOTS, PLANE_CLIENT_ROBOTS, BulletWorld
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
@@ -26,7 +27,6 @@ from tdgc.sim.terrain import (
     make_tile,
     tile_rng,
 )
-from tdgc.sim.world import CLIENT_ROBOTS, PLANE_CLIENT_ROBOTS, World
 from tdgc.tasks.rules import is_fallen
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()
@@ -41,7 +41,7 @@ STAND = (
 UPSIDE_DOWN = np.array([[1.0, 0.0, 0.0, 0.0]])
 
 
-def put(world: World, xy: Array, height: float = STAND, yaw: float = 0.0) -> None:
+def put(world: BulletWorld, xy: Array, height: float = STAND, yaw: float = 0.0) -> None:
     """Place all robots in the nominal pose at ``xy`` (M, 2) m, trunks ``height`` m above z = 0."""
     m = world.num_robots
     position = np.column_stack([np.broadcast_to(xy, (m, 2)), np.full(m, height)])
@@ -49,7 +49,7 @@ def put(world: World, xy: Array, height: float = STAND, yaw: float = 0.0) -> Non
     world.reset_robots(np.arange(m), position, quaternion, np.tile(NOMINAL, (m, 1)))
 
 
-def hold(world: World, steps: int = 1, targets: Array | None = None) -> None:
+def hold(world: BulletWorld, steps: int = 1, targets: Array | None = None) -> None:
     """Run control steps without delay or offset, by default with the nominal pose as target."""
     m = world.num_robots
     wanted = np.broadcast_to(NOMINAL if targets is None else targets, (3, m, 12))
@@ -57,7 +57,7 @@ def hold(world: World, steps: int = 1, targets: Array | None = None) -> None:
         world.step(wanted, np.zeros(m), np.zeros((m, 12)))
 
 
-def snapshot(world: World) -> Array:
+def snapshot(world: BulletWorld) -> Array:
     """Everything measured in the last step, one row per robot, (M, n)."""
     s = world.state
     flat = [s.position, s.quaternion, s.lin_vel, s.ang_vel, s.q, s.qd, s.torque]
@@ -66,9 +66,9 @@ def snapshot(world: World) -> Array:
 
 
 @pytest.fixture
-def plane() -> Iterator[World]:
+def plane() -> Iterator[BulletWorld]:
     """One robot standing on a plane."""
-    world = World(1, ROBOT, PHYSICS)
+    world = BulletWorld(1, ROBOT, PHYSICS)
     put(world, np.zeros(2))
     yield world
     world.close()
@@ -85,7 +85,7 @@ def tiles(families: list[str], level: int = 10, crop: float = 2.0, seed: int = 0
 # ------------------------------------------------------------------ the ground
 
 
-def assert_rays_hit_the_field(world: World, seed: int) -> None:
+def assert_rays_hit_the_field(world: BulletWorld, seed: int) -> None:
     """Check that rays straight down, in the client that holds each row, hit the field's heights."""
     field, rng = world.field, np.random.default_rng(seed)
     assert field is not None
@@ -105,7 +105,7 @@ def assert_rays_hit_the_field(world: World, seed: int) -> None:
 
 def test_heightfield_is_where_numpy_says() -> None:
     """Rays hit the heights of two tiles in one client, of families without any symmetry."""
-    world = World(2, ROBOT, PHYSICS, tiles(["rough", "pillar"], crop=0.0))
+    world = BulletWorld(2, ROBOT, PHYSICS, tiles(["rough", "pillar"], crop=0.0))
     assert len(world._clients) == 1
     assert_rays_hit_the_field(world, 0)
     world.close()
@@ -113,7 +113,7 @@ def test_heightfield_is_where_numpy_says() -> None:
 
 def test_heightfield_of_several_clients_and_after_a_redraw() -> None:
     families = ["rough", "pillar", "stair", "gap", "tilt", "mixed"]
-    world = World(12, ROBOT, PHYSICS, tiles(families * 2))
+    world = BulletWorld(12, ROBOT, PHYSICS, tiles(families * 2))
     field = world.field
     assert field is not None and CLIENT_ROBOTS < 12
     assert [client.robots for client in world._clients] == [(0, 6), (6, 12)]
@@ -135,7 +135,7 @@ def test_a_field_that_never_changes_is_uploaded_as_flat_as_it_is() -> None:
     families = ["rough", "gap", "gap", "gap", "gap", "gap", "pillar", "stair", "tilt", "mixed"]
     for field in (tiles(families), tiles(["gap"] * 12), TileField(1, crop=2.0)):
         field.heights.setflags(write=False)
-        world = World(field.count, ROBOT, PHYSICS, field)
+        world = BulletWorld(field.count, ROBOT, PHYSICS, field)
         assert_rays_hit_the_field(world, 5)
         for client in world._clients:
             heights = field.heights[client.samples]
@@ -150,8 +150,8 @@ def test_a_robot_walks_alike_on_a_field_that_never_changes() -> None:
     fixed = tiles(["stair", "rough"])
     fixed.heights.setflags(write=False)
     np.testing.assert_allclose(
-        trajectory(World(2, ROBOT, PHYSICS, fixed), 1),
-        trajectory(World(2, ROBOT, PHYSICS, tiles(["stair", "rough"])), 1),
+        trajectory(BulletWorld(2, ROBOT, PHYSICS, fixed), 1),
+        trajectory(BulletWorld(2, ROBOT, PHYSICS, tiles(["stair", "rough"])), 1),
         atol=1e-6,
     )
 
@@ -161,7 +161,7 @@ def test_a_robot_stands_on_its_own_tile_in_every_client() -> None:
     ground = np.linspace(-0.5, 0.5, 11)
     field = TileField(11, crop=2.9)
     field.heights += np.repeat(ground, 161)[:, None].astype(np.float32)
-    world = World(11, ROBOT, PHYSICS, field)
+    world = BulletWorld(11, ROBOT, PHYSICS, field)
     position = np.column_stack([field.origin(np.arange(11)) + [0.75, 4.0], ground + STAND])
     upright = yaw_quaternion(np.zeros(11))
     world.reset_robots(np.arange(11), position, upright, np.tile(NOMINAL, (11, 1)))
@@ -171,11 +171,11 @@ def test_a_robot_stands_on_its_own_tile_in_every_client() -> None:
     world.close()
 
 
-def test_ground_of_a_plane_and_support_of_tiles(plane: World) -> None:
+def test_ground_of_a_plane_and_support_of_tiles(plane: BulletWorld) -> None:
     x = np.array([[0.0, 5.0], [-3.0, 1.0]])
     assert (plane.ground_height(x, x) == 0.0).all() and (plane.support_height(x, x) == 0.0).all()
     field = tiles(["gap", "pillar"], crop=0.0)
-    world = World(2, ROBOT, PHYSICS, field)
+    world = BulletWorld(2, ROBOT, PHYSICS, field)
     for row, extreme in ((0, -0.6), (1, 0.8)):
         part = field.heights[row * 161 : (row + 1) * 161]
         ix, iy = np.argwhere(np.isclose(part, extreme))[0]
@@ -187,13 +187,13 @@ def test_ground_of_a_plane_and_support_of_tiles(plane: World) -> None:
 
 def test_fields_that_do_not_fit() -> None:
     with pytest.raises(ValueError, match=r"^3 robots need as many tiles, not 2$"):
-        World(3, ROBOT, PHYSICS, TileField(2))
+        BulletWorld(3, ROBOT, PHYSICS, TileField(2))
     field = TileField(1, crop=2.9)
     field.heights[5, 5] = HEIGHT_RANGE[1] + 0.01
     with pytest.raises(ValueError, match=r"^heights 0\.00\.\.2\.51 m leave \(-2\.5, 2\.5\) m$"):
-        World(1, ROBOT, PHYSICS, field)
+        BulletWorld(1, ROBOT, PHYSICS, field)
     field.heights[5, 5] = 0.0
-    world = World(1, ROBOT, PHYSICS, field)
+    world = BulletWorld(1, ROBOT, PHYSICS, field)
     field.heights[5, 5] = -2.6
     with pytest.raises(ValueError, match=r"^heights -2.60"):
         world.upload_terrain()
@@ -208,7 +208,7 @@ def resident() -> float:
 
 def test_redraws_leak_nothing() -> None:
     field = TileField(1, crop=2.5)
-    world = World(1, ROBOT, PHYSICS, field)
+    world = BulletWorld(1, ROBOT, PHYSICS, field)
     drawn = [make_tile(family, 1.0, np.random.default_rng(0)) for family in ALL_FAMILIES]
     for k in range(20):
         field.place(0, drawn[k % len(drawn)])
@@ -225,7 +225,7 @@ def test_redraws_leak_nothing() -> None:
 # ------------------------------------------------------------------ one robot
 
 
-def test_free_fall_and_state_of_the_last_step(plane: World) -> None:
+def test_free_fall_and_state_of_the_last_step(plane: BulletWorld) -> None:
     put(plane, np.array([1.0, 2.0]), height=5.0, yaw=0.5)
     hold(plane, 5)
     state, n, dt = plane.state, 40, PHYSICS.dt
@@ -238,7 +238,7 @@ def test_free_fall_and_state_of_the_last_step(plane: World) -> None:
     assert (state.foot_force == 0.0).all() and state.trunk_force[0] == 0.0
 
 
-def mean_foot_force(world: World, steps: int = 25) -> Array:
+def mean_foot_force(world: BulletWorld, steps: int = 25) -> Array:
     """Mean force on each foot over ``steps`` control steps, (M, 4) N."""
     total = np.zeros((world.num_robots, 4))
     for _ in range(steps):
@@ -247,7 +247,7 @@ def mean_foot_force(world: World, steps: int = 25) -> Array:
     return total / steps
 
 
-def test_a_standing_robot_presses_with_its_weight(plane: World) -> None:
+def test_a_standing_robot_presses_with_its_weight(plane: BulletWorld) -> None:
     hold(plane, 200)  # it sways on its soft joints at first
     force = mean_foot_force(plane)[0]
     assert force.sum() == pytest.approx(MASS * G, rel=0.01)
@@ -262,7 +262,7 @@ def test_a_standing_robot_presses_with_its_weight(plane: World) -> None:
 
 
 @pytest.mark.parametrize("payload", [-1.0, 3.0])
-def test_payload_adds_its_weight(plane: World, payload: float) -> None:
+def test_payload_adds_its_weight(plane: BulletWorld, payload: float) -> None:
     plane.payload[0] = payload
     plane.apply_dynamics([0])
     hold(plane, 100)
@@ -283,25 +283,25 @@ def test_a_world_that_cannot_be_built_leaves_no_simulation(monkeypatch: pytest.M
     def connected() -> int:
         return sum(pybullet.isConnected(client) for client in range(64))
 
-    def fail(self: World, *_: object) -> int:
+    def fail(self: BulletWorld, *_: object) -> int:
         raise ValueError("no robot")
 
     before = connected()
-    monkeypatch.setattr(World, "_load_robot", fail)
+    monkeypatch.setattr(BulletWorld, "_load_robot", fail)
     with pytest.raises(ValueError, match="no robot"):
-        World(2, ROBOT, PHYSICS)
+        BulletWorld(2, ROBOT, PHYSICS)
     assert connected() == before
 
 
 def test_all_links_have_the_friction_of_the_physics_until_they_are_given_another() -> None:
-    world = World(1, ROBOT, dataclasses.replace(PHYSICS, friction=0.7))
+    world = BulletWorld(1, ROBOT, dataclasses.replace(PHYSICS, friction=0.7))
     client, body = world._client_of[0], world._bodies[0]
     links = range(-1, client.getNumJoints(body))
     assert {client.getDynamicsInfo(body, link)[1] for link in links} == {0.7}
     world.close()
 
 
-def test_joint_friction_holds_a_joint_back(plane: World) -> None:
+def test_joint_friction_holds_a_joint_back(plane: BulletWorld) -> None:
     """With the motors off, joints released in the air at 3 rad/s move less far with friction."""
     swung = []
     for friction in (0.0, 0.3):
@@ -315,7 +315,7 @@ def test_joint_friction_holds_a_joint_back(plane: World) -> None:
 
 
 @pytest.mark.parametrize("friction", [0.4, 0.8])
-def test_friction_slows_a_sliding_robot(plane: World, friction: float) -> None:
+def test_friction_slows_a_sliding_robot(plane: BulletWorld, friction: float) -> None:
     """Lying on its back and pushed at 1 m/s, the robot loses speed at a rate of mu g."""
     plane.friction[0] = friction
     plane.apply_dynamics([0])
@@ -328,7 +328,7 @@ def test_friction_slows_a_sliding_robot(plane: World, friction: float) -> None:
     assert plane.state.lin_vel[0, 1] == pytest.approx(1.0 - friction * G * seconds, abs=0.08)
 
 
-def test_a_dropped_robot_lands_on_its_feet(plane: World) -> None:
+def test_a_dropped_robot_lands_on_its_feet(plane: BulletWorld) -> None:
     put(plane, np.zeros(2), STAND + 0.1)
     largest = 0.0
     for _ in range(50):
@@ -342,7 +342,7 @@ def test_a_dropped_robot_lands_on_its_feet(plane: World) -> None:
     )
 
 
-def test_a_robot_dropped_on_its_back_hits_with_its_trunk(plane: World) -> None:
+def test_a_robot_dropped_on_its_back_hits_with_its_trunk(plane: BulletWorld) -> None:
     plane.reset_robots([0], np.array([[0.0, 0.0, 0.30]]), UPSIDE_DOWN, NOMINAL[None])
     assert plane.state.gravity[0].tolist() == [0.0, 0.0, 1.0]
     largest = 0.0
@@ -354,7 +354,7 @@ def test_a_robot_dropped_on_its_back_hits_with_its_trunk(plane: World) -> None:
     assert (plane.state.foot_force == 0.0).all()
 
 
-def test_a_robot_on_its_knees_presses_with_its_legs(plane: World) -> None:
+def test_a_robot_on_its_knees_presses_with_its_legs(plane: BulletWorld) -> None:
     """With the calves folded up the knees carry the load, and none of it counts as foot force."""
     folded = np.tile([0.0, 0.0, -2.7], 4)
     upright = yaw_quaternion(np.zeros(1))
@@ -365,7 +365,7 @@ def test_a_robot_on_its_knees_presses_with_its_legs(plane: World) -> None:
 
 
 def test_push_adds_a_velocity() -> None:
-    world = World(2, ROBOT, PHYSICS)
+    world = BulletWorld(2, ROBOT, PHYSICS)
     put(world, np.array([[0.0, 0.0], [3.0, 0.0]]), height=5.0)
     hold(world)
     before = world.state.lin_vel.copy()
@@ -382,7 +382,7 @@ def test_push_adds_a_velocity() -> None:
 
 
 def test_motor_strength_scales_torque() -> None:
-    world = World(2, ROBOT, PHYSICS)
+    world = BulletWorld(2, ROBOT, PHYSICS)
     put(world, np.array([[0.0, 0.0], [3.0, 0.0]]), height=5.0)
     world.strength[1] = 0.5
     world.physics = PhysicsConfig(
@@ -394,7 +394,7 @@ def test_motor_strength_scales_torque() -> None:
     world.close()
 
 
-def test_joints_keep_their_speed_limits_in_the_air(plane: World) -> None:
+def test_joints_keep_their_speed_limits_in_the_air(plane: BulletWorld) -> None:
     """As the legs swing between extremes, some joint exceeds 12 rad/s but none 30 rad/s."""
     put(plane, np.zeros(2), height=20.0)
     fastest = np.zeros(12)
@@ -405,7 +405,7 @@ def test_joints_keep_their_speed_limits_in_the_air(plane: World) -> None:
     assert fastest.max() > 12.0
 
 
-def test_joint_offset_shifts_where_the_motors_pull(plane: World) -> None:
+def test_joint_offset_shifts_where_the_motors_pull(plane: BulletWorld) -> None:
     put(plane, np.zeros(2), height=20.0)
     offset = np.full((1, 12), 0.02)
     for _ in range(30):
@@ -432,7 +432,7 @@ def sinking(family: str, seed: int) -> tuple[int, int]:
     """Number of foot samples on the tile, and of those more than 1 cm below its surface."""
     robots, index, rng = 16, np.arange(16), np.random.default_rng(seed)
     field = tiles([family] * robots, crop=1.0, seed=seed)
-    loco = Locomotion(robots, ROBOT, PHYSICS, field)
+    loco = Locomotion(BulletWorld(robots, ROBOT, PHYSICS, field), LowLevelConfig())
     world, samples, sunk = loco.world, 0, 0
     done = np.ones(robots, dtype=bool)
     for _ in range(250):
@@ -472,7 +472,7 @@ def test_feet_do_not_sink(family: str) -> None:
 
 def drive(delay: float, late: int, steps: int = 12) -> Array:
     """Snapshots (steps, n) of a robot on a plane, with random targets delayed by ``late`` steps."""
-    world = World(1, ROBOT, PHYSICS)
+    world = BulletWorld(1, ROBOT, PHYSICS)
     put(world, np.zeros(2))
     drawn = np.random.default_rng(0).uniform(-0.5, 0.5, (steps, 12)) + NOMINAL
     sequence = np.concatenate([np.tile(NOMINAL, (4, 1)), drawn])
@@ -494,12 +494,12 @@ def test_a_delay_of_a_control_step_is_a_target_a_step_older() -> None:
 
 def test_a_delay_within_a_control_step() -> None:
     """With a delay of 10 ms, the first four of eight physics steps still use the older target."""
-    world = World(1, ROBOT, PhysicsConfig(control_dt=0.02, substeps=8))
+    world = BulletWorld(1, ROBOT, PhysicsConfig(control_dt=0.02, substeps=8))
     put(world, np.zeros(2), height=5.0)
     old, new = NOMINAL, NOMINAL + 0.3
     world.step(np.stack([new, old, old])[:, None], np.array([0.010]), np.zeros((1, 12)))
     late = snapshot(world)
-    other = World(1, ROBOT, PhysicsConfig(control_dt=0.01, substeps=4))
+    other = BulletWorld(1, ROBOT, PhysicsConfig(control_dt=0.01, substeps=4))
     put(other, np.zeros(2), height=5.0)
     hold(other, 1, old)
     hold(other, 1, new)
@@ -513,7 +513,7 @@ def test_a_delay_within_a_control_step() -> None:
 
 def test_robots_do_not_touch_each_other() -> None:
     """Two robots in the same spot stand exactly as a single one does."""
-    both, alone = World(2, ROBOT, PHYSICS), World(1, ROBOT, PHYSICS)
+    both, alone = BulletWorld(2, ROBOT, PHYSICS), BulletWorld(1, ROBOT, PHYSICS)
     for world in (both, alone):
         put(world, np.zeros(2))
         hold(world, 30)
@@ -526,7 +526,7 @@ def test_robots_do_not_touch_each_other() -> None:
 
 
 def trajectory(
-    world: World, robot: int, others: float = 1.0, steps: int = 40, seed: int = 0
+    world: BulletWorld, robot: int, others: float = 1.0, steps: int = 40, seed: int = 0
 ) -> Array:
     """Snapshots (steps, n) of one robot under random targets; ``others`` scales everyone else's."""
     m, rng = world.num_robots, np.random.default_rng(seed)
@@ -553,12 +553,12 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
     m = 1 + (CLIENT_ROBOTS if terrain else PLANE_CLIENT_ROBOTS)
     rng = np.random.default_rng(0)
 
-    def disturb(world: World) -> None:
+    def disturb(world: BulletWorld) -> None:
         world.friction[:], world.payload[:], world.armature[:] = 0.6, 2.0, 0.01
         world.apply_dynamics(np.arange(m))
 
     field = tiles((["rough", "stair", "gap"] * m)[:m], level=6) if terrain else None
-    world = World(m, ROBOT, PHYSICS, field)
+    world = BulletWorld(m, ROBOT, PHYSICS, field)
     xy = np.column_stack([np.arange(m), np.zeros(m)])
     if field is not None:
         xy = field.origin(np.arange(m)) + np.array([3.0, 4.0])
@@ -567,7 +567,7 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
     world.reset_robots(np.arange(m), np.column_stack([xy, ground + STAND + 0.1]), upright, pose)
     disturb(world)
 
-    def stumble(worlds: list[World], steps: int) -> bool:
+    def stumble(worlds: list[BulletWorld], steps: int) -> bool:
         """Step all worlds with the same random targets; return whether they stay identical."""
         alike = True
         for _ in range(steps):
@@ -577,8 +577,8 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
             alike &= all((snapshot(each) == snapshot(worlds[0])).all() for each in worlds)
         return alike
 
-    def anew() -> World:
-        other = World(m, ROBOT, PHYSICS, field)
+    def anew() -> BulletWorld:
+        other = BulletWorld(m, ROBOT, PHYSICS, field)
         disturb(other)
         for name in ("position", "quaternion", "lin_vel", "ang_vel", "q", "qd", "rotor_excess"):
             getattr(other.state, name)[:] = getattr(world.state, name)
@@ -605,32 +605,32 @@ def test_after_it_forgot_a_world_goes_on_as_one_built_anew(terrain: bool) -> Non
 @pytest.mark.parametrize("robots", [5, 11])
 def test_a_robot_does_not_depend_on_the_others(robots: int) -> None:
     """The last of 5 robots in one client, and of 11 in two, moves the same whatever the rest do."""
-    one = trajectory(World(robots, ROBOT, PHYSICS), robots - 1)
+    one = trajectory(BulletWorld(robots, ROBOT, PHYSICS), robots - 1)
     np.testing.assert_array_equal(
-        trajectory(World(robots, ROBOT, PHYSICS), robots - 1, others=-0.5), one
+        trajectory(BulletWorld(robots, ROBOT, PHYSICS), robots - 1, others=-0.5), one
     )
 
 
 def test_a_robot_alone_moves_as_among_others() -> None:
-    among = trajectory(World(4, ROBOT, PHYSICS), 0)
-    np.testing.assert_array_equal(trajectory(World(1, ROBOT, PHYSICS), 0), among)
+    among = trajectory(BulletWorld(4, ROBOT, PHYSICS), 0)
+    np.testing.assert_array_equal(trajectory(BulletWorld(1, ROBOT, PHYSICS), 0), among)
     assert np.ptp(among[:, :2], axis=0).max() > 0.02
 
 
 def test_a_robot_on_terrain_does_not_depend_on_the_others() -> None:
     families = ["stair", "rough", "rough"]
-    one = trajectory(World(3, ROBOT, PHYSICS, tiles(families)), 2)
-    other = trajectory(World(3, ROBOT, PHYSICS, tiles(families)), 2, others=-0.5)
+    one = trajectory(BulletWorld(3, ROBOT, PHYSICS, tiles(families)), 2)
+    other = trajectory(BulletWorld(3, ROBOT, PHYSICS, tiles(families)), 2, others=-0.5)
     np.testing.assert_array_equal(other, one)
 
 
 def test_visuals_do_not_change_how_a_robot_moves() -> None:
-    drawn, plain = (World(2, ROBOT, PHYSICS, visual=visual) for visual in (True, False))
+    drawn, plain = (BulletWorld(2, ROBOT, PHYSICS, visual=visual) for visual in (True, False))
     np.testing.assert_array_equal(trajectory(drawn, 1), trajectory(plain, 1))
 
 
 def test_retired_robots_are_gone_and_the_others_go_on() -> None:
-    worlds = [World(3, ROBOT, PHYSICS) for _ in range(2)]
+    worlds = [BulletWorld(3, ROBOT, PHYSICS) for _ in range(2)]
     for world in worlds:
         put(world, np.array([[0.0, 0.0], [0.0, 2.0], [0.0, 4.0]]), STAND + 0.02)
         hold(world, 5)
@@ -648,7 +648,7 @@ def test_retired_robots_are_gone_and_the_others_go_on() -> None:
 
 def fingerprint() -> str:
     """Hash of a trajectory on terrain."""
-    rows = trajectory(World(2, ROBOT, PHYSICS, tiles(["rough", "stair"])), 1)
+    rows = trajectory(BulletWorld(2, ROBOT, PHYSICS, tiles(["rough", "stair"])), 1)
     return hashlib.sha256(rows.tobytes()).hexdigest()
 
 
@@ -664,7 +664,7 @@ def test_the_same_seed_gives_the_same_bits_here_and_in_another_process() -> None
 
 
 def test_bullet_time_is_counted_and_clients_are_closed() -> None:
-    world = World(PLANE_CLIENT_ROBOTS + 1, ROBOT, PHYSICS)
+    world = BulletWorld(PLANE_CLIENT_ROBOTS + 1, ROBOT, PHYSICS)
     assert world.bullet_seconds == 0.0
     hold(world)
     assert world.bullet_seconds > 0.0
@@ -679,7 +679,7 @@ def test_the_trunks_force_is_its_largest_within_a_control_step(
 ) -> None:
     """In eight physics steps the trunk is hit in the second, third and sixth."""
     pose = nominal_pose(RobotConfig())
-    world = World(1, RobotConfig(), PhysicsConfig(substeps=8, hold=1))
+    world = BulletWorld(1, RobotConfig(), PhysicsConfig(substeps=8, hold=1))
     upright = np.array([[0.0, 0.0, 0.0, 1.0]])
     world.reset_robots([0], np.array([[0.0, 0.0, 1.0]]), upright, pose[None])
     client, body = world._clients[0], world._bodies[0]
@@ -693,7 +693,7 @@ def test_the_trunks_force_is_its_largest_within_a_control_step(
         return [(0, client.ground, body, -1, -1)]
 
     client.getContactPoints = touched
-    monkeypatch.setattr(World, "_force", lambda *_: hit[0])
+    monkeypatch.setattr(BulletWorld, "_force", lambda *_: hit[0])
     world.step(np.tile(pose, (3, 1, 1)), np.zeros(1), np.zeros((1, 12)))
     assert world.state.trunk_force[0] == 90.0
     world.close()

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tdgc.benchmark.drivers import Driver
 from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig
 from tdgc.policies import Policy
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
@@ -178,19 +179,21 @@ class Episode(EpisodeRecord):
         return row | {f"share_{g}": round(x, 4) for g, x in zip(GAITS, self.shares, strict=True)}
 
 
-def physics_of(config: LowLevelConfig, condition: Condition) -> PhysicsConfig:
-    """Return the benchmark's physics at the low policy's control rate.
+def benchmarked(config: LowLevelConfig, condition: Condition) -> LowLevelConfig:
+    """Return the MDP of the low policy in the benchmark's physics, at its own control rate.
 
-    It is the same for every policy, whatever physics that was trained in.
+    The physics is the same for every policy, whatever physics that was trained in.
     """
     physics, control_dt = PhysicsConfig(), config.physics.control_dt
+    hold = physics.hold
     if condition.physics_hz is None:
-        held = physics.hold * physics.dt  # s; a shorter step where it does not divide the control's
-        substeps = physics.hold * math.ceil(control_dt / held - 1e-6)
-        return dataclasses.replace(physics, control_dt=control_dt, substeps=substeps)
-    substeps = round(control_dt * condition.physics_hz)
-    # Torque is updated at each physics step, as by a motor driver at that rate.
-    return dataclasses.replace(physics, control_dt=control_dt, substeps=substeps, hold=1)
+        held = hold * physics.dt  # s; a shorter step where it does not divide the control's
+        substeps = hold * math.ceil(control_dt / held - 1e-6)
+    else:
+        # Torque is updated at each physics step, as by a motor driver at that rate.
+        substeps, hold = round(control_dt * condition.physics_hz), 1
+    physics = dataclasses.replace(physics, control_dt=control_dt, substeps=substeps, hold=hold)
+    return dataclasses.replace(config, physics=physics)
 
 
 def tile_of(seed: int, family: str, level: int, episode: int, condition: str = "nominal") -> Tile:
@@ -274,12 +277,13 @@ class Batch:
             self.probes = Noise(condition.noise, episode_draws(cell, seed, _PROBES))
             clock = episode_draws(cell, seed, _CLOCK).uniform(0.0, 1.0, (cell.count,))
         if make_world is None:
-            world, physics = None, physics_of(config, condition)
+            config = benchmarked(config, condition)
+            world: World = BulletWorld(cell.count, config.robot, config.physics, self.field)
         else:
-            world, physics = make_world(self.field), config.physics
-        loco = Locomotion(cell.count, config.robot, physics, self.field, config.gyro, world=world)
+            world = make_world(self.field)
+        physics, loco = config.physics, Locomotion(world, config)
         self.loco, self.origin = loco, self.field.origin(rows)
-        world, loco.delay[:] = loco.world, condition.latency
+        loco.delay[:] = condition.latency
         world.friction[:] = physics.friction if condition.friction is None else condition.friction
         world.payload[:], world.armature[:] = condition.payload, condition.armature
         world.strength[:] = condition.motor

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.benchmark.evaluation import CONDITIONS, physics_of
+from tdgc.benchmark.evaluation import CONDITIONS, benchmarked
 from tdgc.config import CommandRanges
 from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import CONTINUOUS, INDEX, command_bounds
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
@@ -47,9 +48,8 @@ def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Lo
     Raises:
         FloatingPointError: a robot's state is not finite.
     """
-    config = mdp_of(low)
-    physics = physics_of(config, CONDITIONS["nominal"])
-    loco = Locomotion(m, config.robot, physics, None, config.gyro)
+    config = benchmarked(mdp_of(low), CONDITIONS["nominal"])
+    loco = Locomotion(BulletWorld(m, config.robot, config.physics), config)
     executor, rows = Executor(loco, low), np.arange(m)
     rng = np.random.default_rng(seed)
     spots = 5.0 * np.stack([rows % 10, rows // 10], axis=1).astype(np.float64)

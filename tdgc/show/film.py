@@ -23,11 +23,11 @@ from tdgc.errors import InputError, require
 from tdgc.files import atomic
 from tdgc.parallel.jobs import run_jobs
 from tdgc.show.plots import DESIRED, GAIT_COLOURS, MEASURED, POLICY_COLOURS, sheet
+from tdgc.sim.bullet_world import Stage
 from tdgc.sim.commands import CONTINUOUS, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TILE_SIZE, Tile, TileField
-from tdgc.sim.world import Stage
 from tdgc.tasks.rules import GOAL_RADIUS
 
 FRAME_SECONDS = 0.04  # 25 frames per second: every second control step

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import CONDITIONS, Batch, Cell, physics_of, run_cell, tile_of
+from tdgc.benchmark.evaluation import CONDITIONS, Batch, Cell, benchmarked, run_cell, tile_of
 from tdgc.policies import Policy
 from tdgc.show.film import set_stage
+from tdgc.sim.bullet_world import BulletWorld, Stage
 from tdgc.sim.commands import (
     CONTINUOUS,
     INDEX,
@@ -22,11 +23,11 @@ from tdgc.sim.commands import (
     default_command,
     gait_index,
 )
+from tdgc.sim.display import WindowError
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TileField
-from tdgc.sim.world import Stage, WindowError
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.rules import GOING, OUTCOMES, outcome
@@ -88,10 +89,10 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
     Raises:
         WindowError: the window cannot be opened.
     """
-    config, tile = mdp_of(low), tile_of(seed, cell.family, cell.level, cell.first)
+    config = benchmarked(mdp_of(low), CONDITIONS["nominal"])
+    tile = tile_of(seed, cell.family, cell.level, cell.first)
     stage, field = set_stage(tile, config.robot, window=True), TileField.of(tile)
-    physics = physics_of(config, CONDITIONS["nominal"])
-    loco = Locomotion(1, config.robot, physics, field, config.gyro)
+    loco = Locomotion(BulletWorld(1, config.robot, config.physics, field), config)
     executor = Executor(loco, low)
     decoder, start = CommandDecoder(config.commands), default_command()
     for j, name in enumerate(CONTINUOUS):

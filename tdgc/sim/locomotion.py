@@ -13,7 +13,15 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.config import ConfigError, PhysicsConfig, RandomisationConfig, Range, RobotConfig
+from tdgc.config import (
+    ConfigError,
+    LowLevelConfig,
+    PhysicsConfig,
+    RandomisationConfig,
+    Range,
+    RobotConfig,
+)
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, NAMES, SIDEWAYS, default_command, gait_index, observed_command
 from tdgc.sim.gaits import GAITS, PhaseClock, foot_phases
 from tdgc.sim.geometry import Geometry
@@ -39,7 +47,6 @@ from tdgc.sim.robot import (
     yaw_quaternion,
 )
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import TileField
 from tdgc.sim.world import World
 from tdgc.state import State, copies, fill
 
@@ -87,7 +94,7 @@ def check_robot(
     Raises:
         ConfigError: an unusable URDF, or a range outside what is allowed; the message says which.
     """
-    world = World(1, robot, physics)
+    world = BulletWorld(1, robot, physics)
     try:
         check_randomisation(randomisation, physics, world.state.geometry.trunk_mass)
     finally:
@@ -97,7 +104,9 @@ def check_robot(
 class Locomotion:
     """M robots that take 12 actions each control step and follow 15 commands.
 
-    They live in ``world``, or in a new Bullet world if that is None.
+    Args:
+        world: the robots.
+        config: the MDP of the low policy, which says how the robots are controlled and observed.
 
     Attributes:
         command: (M, 15), to be set by the caller.
@@ -113,21 +122,11 @@ class Locomotion:
         joint_offset: (M, 12) rad, error of each joint's zero.
     """
 
-    def __init__(
-        self,
-        num_robots: int,
-        robot: RobotConfig,
-        physics: PhysicsConfig,
-        field: TileField | None,
-        gyro: bool = False,
-        visual: bool = False,
-        world: World | None = None,
-    ) -> None:
-        self.num_robots = num_robots
-        self.robot = robot
-        self.physics = physics
-        self.layout = actor_layout(robot, gyro)
-        self.world = world or World(num_robots, robot, physics, field, visual)
+    def __init__(self, world: World, config: LowLevelConfig) -> None:
+        self.world = world
+        self.robot, self.physics = robot, physics = config.robot, config.physics
+        self.num_robots = num_robots = world.num_robots
+        self.layout = actor_layout(robot, config.gyro)
         self.clock = PhaseClock(num_robots)
         self.nominal = nominal_pose(robot)
         self.command = np.tile(default_command(), (num_robots, 1))
@@ -140,7 +139,7 @@ class Locomotion:
         self.targets = np.tile(self.nominal, (kept, num_robots, 1))
         self.delay = np.zeros(num_robots)
         self.joint_offset = np.zeros((num_robots, NUM_JOINTS))
-        geometry = self.world.state.geometry
+        geometry = world.state.geometry
         self._feet = nominal_feet(robot, geometry)
         self._stand = nominal_height(robot, geometry)
         self._pose = self._pose_of = np.empty(0)  # cached ``pose`` and what it was computed from

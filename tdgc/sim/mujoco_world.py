@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
 from tdgc.config.settings import NotNegative, Positive
+from tdgc.sim.display import WindowError, check_display
 from tdgc.sim.geometry import read_geometry
-from tdgc.sim.robot import GRAVITY, Array, RobotState, pd_torque, rotation_matrix
+from tdgc.sim.robot import GRAVITY, Array, pd_torque, rotation_matrix
 from tdgc.sim.terrain import CELL, TileField
 from tdgc.sim.urdf import JOINTS, urdf_path
-from tdgc.sim.world import WindowError, World, check_display
+from tdgc.sim.world import World
 
 _CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
 _NAME = "ground"
@@ -76,14 +77,13 @@ class MujocoConfig:
 class MujocoWorld(World):
     """One robot on the only tile of a field, simulated by MuJoCo instead of Bullet.
 
-    It supports what an episode needs of a ``World``, but not changing the terrain, ``forget``,
-    ``picture`` or ``joint_friction``: dry friction is that of the settings. ``armature`` is added
-    to that of the settings.
+    ``armature`` is added to that of the settings; dry friction is that of the settings, and
+    ``joint_friction`` is not used.
 
     Args:
         robot: its URDF, gains and limits.
         physics: as returned by ``config.physics``.
-        field: (1, 1) tiles.
+        field: one tile.
         config: MuJoCo's settings.
         visual: keep shapes that only a window shows.
 
@@ -99,10 +99,7 @@ class MujocoWorld(World):
         config: MujocoConfig,
         visual: bool = False,
     ) -> None:
-        self.num_robots, self.robot, self.physics, self.field = 1, robot, physics, field
-        self._make_dynamics()
-        self._active = np.arange(1)
-        self.state = RobotState.zeros(read_geometry(robot), 1)
+        super().__init__(1, robot, physics, field, read_geometry(robot))
         self.model = _build(robot, field, config, visual)
         self.data = mujoco.MjData(self.model)
         joints = [self.model.joint(name) for name in JOINTS]
@@ -129,7 +126,6 @@ class MujocoWorld(World):
         return parts
 
     def _put(self, i: int) -> None:
-        """Set MuJoCo's robot to its pose and velocities in ``state``."""
         state, data = self.state, self.data
         mujoco.mj_resetData(self.model, data)
         data.qpos[:3], data.qpos[3:7] = state.position[i], np.roll(state.quaternion[i], 1)
@@ -137,13 +133,11 @@ class MujocoWorld(World):
         self._move_trunk(i)
 
     def _move_trunk(self, i: int) -> None:
-        """Give the trunk its velocities in ``state``."""
         state, velocity = self.state, self.data.qvel
         turn = rotation_matrix(state.quaternion)[i].T
         velocity[:3], velocity[3:6] = state.lin_vel[i], turn @ state.ang_vel[i]
 
     def apply_dynamics(self, index: ArrayLike) -> None:
-        """Pass on changes of ``friction``, ``payload`` and ``armature`` to MuJoCo."""
         model, (mass, inertia) = self.model, self._trunk
         # The payload is spread over the trunk, so the inertia scales with the mass.
         share = (mass + self.payload) / mass
@@ -155,8 +149,10 @@ class MujocoWorld(World):
     def retire(self, index: ArrayLike) -> None:
         """Do nothing: the episode of the only robot has ended."""
 
+    def forget(self) -> None:
+        self._put(0)
+
     def step(self, targets: Array, delay: Array, offset: Array) -> None:
-        """Simulate one control step of PD control, as ``World.step``."""
         model, data, state = self.model, self.data, self.state
         state.trunk_force = np.zeros(1)
         for target in self._wanted(targets, delay, offset):

@@ -1,6 +1,6 @@
 """The robot in plain numpy: nominal pose, joint PD, leg kinematics and state.
 
-``tdgc.sim.world`` fills a ``RobotState`` from Bullet and calls ``pd_torque`` for joint torques.
+A ``World`` fills a ``RobotState`` from its simulator and calls ``pd_torque`` for joint torques.
 Arrays have a leading axis of M robots. Legs are in the order of ``tdgc.sim.gaits.FEET``.
 """
 

@@ -1,111 +1,43 @@
-"""A Bullet world of M robots: the only module that imports pybullet.
+"""What every simulator of M robots offers, whatever computes their motion.
 
-A collision mask lets robots pass through each other. Arrays have a leading axis of M robots.
+``tdgc.sim.bullet_world`` is the one that robots are trained and evaluated in;
+``tdgc.sim.mujoco_world`` is there to compare. Arrays have a leading axis of M robots.
 """
 
-import contextlib
-import ctypes
-import functools
-import importlib
-import os
-import sys
-import time
-from collections.abc import Callable, Iterator
-from operator import itemgetter
-from pathlib import Path
-from typing import Any
+from abc import ABC, abstractmethod
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tdgc.config import ConfigError, PhysicsConfig, RobotConfig
-from tdgc.sim.geometry import geometry_of
-from tdgc.sim.robot import (
-    GRAVITY,
-    NUM_JOINTS,
-    Array,
-    RobotState,
-    check_nominal_pose,
-    pd_torque,
-    quaternion_product,
-    rotation_matrix,
-)
-from tdgc.sim.rotors import excess_momentum
-from tdgc.sim.terrain import CELL, HEIGHT_RANGE, TILE_SAMPLES, TileField
-from tdgc.sim.urdf import JOINTS, merged_file, read_urdf, urdf_path
-
-_GROUND, _ROBOT = 1, 2  # collision groups: robots collide with the ground only
-_TRUNK = -1  # Bullet's index of a body's root link
-_PARKED = 50.0  # m, lift that clears all terrain, which stays within HEIGHT_RANGE
-_SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out
-_FOOT_REACH = 0.03  # m beyond the foot's radius: nearer calf contacts are the foot's
+from tdgc.config import PhysicsConfig, RobotConfig
+from tdgc.sim.geometry import Geometry
+from tdgc.sim.robot import Array, RobotState
+from tdgc.sim.terrain import TileField
 
 
-def _load() -> Any:
-    """Import PyBullet without its build-time message, which every process would print over
-    progress bars."""
-    stream = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        return importlib.import_module("pybullet")
-    finally:
-        os.dup2(stream, 2)
-        os.close(stream)
+class World(ABC):
+    """M robots on a plane, or each on its own tile of a field.
 
+    The dynamics are nominal at first; the caller changes their arrays in place and then calls
+    ``apply_dynamics``.
 
-pybullet = _load()
-
-
-class _Client:
-    """pybullet's functions bound to one connection.
-
-    pybullet_utils' BulletClient binds at every call, which costs as much as a short call. Here
-    each function is bound once, on first use.
-    """
-
-    def __init__(self, robots: tuple[int, int], window: bool) -> None:
-        self.id: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
-        self.robots = robots  # rows of the world: the first, and one past the last
-        self.rows: dict[int, int] = {}  # body of this client -> row of the world
-        self.ground = -1
-        self.shape = -1
-        self.samples = slice(0, 0)  # this client's part of the field, along x
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        bound = functools.partial(getattr(pybullet, name), physicsClientId=self.id)
-        setattr(self, name, bound)
-        return bound
-
-
-#: Robots per Bullet client. For each robot's island Bullet walks all constraints of the client, so
-#: the time per robot grows with their number. On a plane without rotors, a step takes 44 us per
-#: robot with 5 robots in a client, 46 with 10, 54 with 25, 75 with 50 and 122 with 100. Each client
-#: costs Python time as well, more with rotors; on a plane, where Bullet's share is smaller, 36
-#: robots with rotors are 12 % faster in two clients than in four.
-CLIENT_ROBOTS, PLANE_CLIENT_ROBOTS = 10, 20
-
-
-class World:
-    """M robots on a plane, or each on its own row of tiles in a field.
-
-    Robots are spread over Bullet clients with at most ``CLIENT_ROBOTS`` each, or
-    ``PLANE_CLIENT_ROBOTS`` on a plane; a client holds only its own robots' part of the field.
-    ``visual`` loads what pictures need, ``window`` opens Bullet's own window. The dynamics are
-    nominal at first; the caller changes their arrays in place and then calls ``apply_dynamics``.
+    Args:
+        num_robots: M.
+        robot: gains, limits and the nominal pose.
+        physics: time steps and the nominal friction.
+        field: M tiles; None for a plane.
+        geometry: of the robot.
 
     Raises:
-        ConfigError: the robot's URDF is missing, or not of a robot that this package can drive.
         ValueError: ``field`` has not one tile per robot.
 
     Attributes:
         state: the ``RobotState`` after the last step, push or reset.
         friction: (M,) coefficient of friction of all links.
         payload: (M,) kg, spread over the trunk.
-        armature: (M,) kg m^2, rotor inertia of each joint, as in ``tdgc.sim.rotors``.
+        armature: (M,) kg m^2, rotor inertia of each joint.
         strength: (M, 1) or (M, 12) motor strength, a factor on gains and torque limits.
         joint_friction: (M, 1) N m, dry friction in each joint.
-        bullet_seconds: wall time spent inside Bullet's step so far.
     """
 
     def __init__(
@@ -113,166 +45,58 @@ class World:
         num_robots: int,
         robot: RobotConfig,
         physics: PhysicsConfig,
-        field: TileField | None = None,
-        visual: bool = False,
-        window: bool = False,
+        field: TileField | None,
+        geometry: Geometry,
     ) -> None:
         if field is not None and field.count != num_robots:
             raise ValueError(f"{num_robots} robots need as many tiles, not {field.count}")
-        self.num_robots = num_robots
-        self.robot = robot
-        self.physics = physics
-        self.field = field
-        self._visual = visual
-        self._make_dynamics()
-        self.bullet_seconds = 0.0
-        urdf = read_urdf(robot)
-        self.state = RobotState.zeros(geometry_of(urdf), num_robots)
-        check_nominal_pose(robot, self.state.geometry)
-        self._clients: list[_Client] = []
-        self._bodies: list[int] = []
-        self._client_of: list[_Client] = []
-        parts = -(-num_robots // (PLANE_CLIENT_ROBOTS if field is None else CLIENT_ROBOTS))
-        try:
-            with merged_file(urdf) as file:
-                for rows in np.array_split(np.arange(num_robots), parts):
-                    self._connect(rows, file, window)
-        except BaseException:
-            self.close()
-            raise
-        trunk = self._client_of[0].getDynamicsInfo(self._bodies[0], _TRUNK)
-        # Bullet's pose of a robot is that of the trunk's inertial frame: these are the centre of
-        # mass and the orientation of the principal axes in the trunk's frame.
-        self._centre, self._axes = map(np.array, trunk[3:5])
-        self._to_axes = rotation_matrix(self._axes[None])[0].T
-        self._inertia = {link: self._links_inertia(link) for link in (_TRUNK, *self._joints)}
-        self._active = np.arange(num_robots)
-
-    def _make_dynamics(self) -> None:
-        """Create the arrays of the dynamics, with nominal values."""
-        m = self.num_robots
-        self.friction = np.full(m, self.physics.friction)
+        m = num_robots
+        self.num_robots, self.robot, self.physics, self.field = m, robot, physics, field
+        self.state = RobotState.zeros(geometry, m)
+        self.friction = np.full(m, physics.friction)
         self.payload, self.armature = np.zeros((2, m))
         self.strength, self.joint_friction = np.ones((m, 1)), np.zeros((m, 1))
+        self._active = np.arange(m)  # robots that are simulated
 
-    def _connect(self, rows: NDArray[np.int64], urdf: Path, window: bool) -> None:
-        """Create a client for the robots ``rows`` (n,), with their ground."""
-        client = _Client((int(rows[0]), int(rows[-1]) + 1), window)
-        self._clients.append(client)
-        client.setGravity(0.0, 0.0, -GRAVITY)
-        # The solver must not stop early: the worst residual would couple the robots.
-        client.setPhysicsEngineParameter(
-            fixedTimeStep=self.physics.hold * self.physics.dt,
-            numSubSteps=self.physics.hold if self.physics.hold > 1 else 0,
-            numSolverIterations=self.physics.solver_iterations,
-            solverResidualThreshold=0.0,
-            deterministicOverlappingPairs=1,
-        )
-        self._make_ground(client)
-        for k in range(len(rows)):
-            self._bodies.append(self._load_robot(client, k, urdf))
-            self._client_of.append(client)
-            client.rows[self._bodies[-1]] = int(rows[k])
+    @abstractmethod
+    def apply_dynamics(self, index: ArrayLike) -> None:
+        """Pass on changes of ``friction``, ``payload`` and ``armature`` of the robots ``index``
+        (n,) to the simulator; ``strength`` and ``joint_friction`` are read at every step."""
 
-    def _make_ground(self, client: _Client) -> None:
-        if self.field is None:
-            shape = client.createCollisionShape(pybullet.GEOM_PLANE)
-            client.ground = client.createMultiBody(0.0, shape)
-        else:
-            client.samples = slice(*(TILE_SAMPLES * row for row in client.robots))
-            heights = self.field.heights[client.samples]
-            low, high = float(heights.min()), float(heights.max())
-            if heights.flags.writeable:
-                # Bullet keeps the height range of the first upload, so that spans everything
-                # that tiles can ever need; the second sends the heights.
-                low, high = HEIGHT_RANGE
-                spanning = np.zeros_like(heights)
-                spanning[0, 0], spanning[0, 1] = HEIGHT_RANGE
-                client.shape = self._upload(client, spanning, -1)
-                self._upload(client, heights, client.shape)
-            else:
-                client.shape = self._upload(client, heights, -1)
-            nx, ny = heights.shape
-            centre = [
-                (client.samples.start + 0.5 * (nx - 1)) * CELL,
-                0.5 * (ny - 1) * CELL,
-                0.5 * (low + high),
-            ]
-            # Without another visual shape, Bullet keeps 360 bytes per sample to draw the field.
-            drawn = -1
-            if not self._visual:
-                drawn = client.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001)
-            client.ground = client.createMultiBody(0.0, client.shape, drawn, basePosition=centre)
-        client.changeDynamics(client.ground, -1, lateralFriction=1.0)  # the feet set the friction
-        client.setCollisionFilterGroupMask(client.ground, -1, _GROUND, _ROBOT)
+    @abstractmethod
+    def step(self, targets: Array, delay: Array, offset: Array) -> None:
+        """Simulate one control step of PD control.
 
-    def _upload(self, client: _Client, heights: NDArray[np.float32], replace: int) -> int:
-        """Send heights to Bullet after checking their range, which Bullet does not."""
-        low, high = float(heights.min()), float(heights.max())
-        if low < HEIGHT_RANGE[0] or high > HEIGHT_RANGE[1]:
-            raise ValueError(f"heights {low:.2f}..{high:.2f} m leave {HEIGHT_RANGE} m")
-        return int(
-            client.createCollisionShape(
-                pybullet.GEOM_HEIGHTFIELD,
-                meshScale=[CELL, CELL, 1.0],
-                heightfieldData=heights.T.ravel(),  # Bullet's rows run along x
-                numHeightfieldRows=heights.shape[0],
-                numHeightfieldColumns=heights.shape[1],
-                replaceHeightfieldIndex=replace,
-            )
-        )
-
-    def upload_terrain(self, index: ArrayLike | None = None) -> None:
-        """Send the field's heights to Bullet after they were changed in place.
-
-        With ``index`` only the clients of those robots are updated. This takes about 1 us for each
-        sample of these clients: do it at the end of an episode, not in every step.
-
-        Raises:
-            ValueError: heights outside ``HEIGHT_RANGE``.
+        Args:
+            targets: (H, M, 12) rad, the joint targets of this control step and the H-1 before.
+            delay: (M,) s until a target takes effect, at most H-1 control steps.
+            offset: (M, 12) rad, error of each joint's zero.
         """
-        assert self.field is not None, "a plane has no heights"
-        rows = range(self.num_robots) if index is None else np.asarray(index)
-        for client in dict.fromkeys(self._client_of[i] for i in rows):
-            self._upload(client, self.field.heights[client.samples], client.shape)
 
-    def _load_robot(self, client: _Client, place: int, urdf: Path) -> int:
-        # Far apart and high up, so that nothing is in contact before the first reset.
-        try:
-            body = client.loadURDF(
-                str(urdf),
-                basePosition=[2.0 * place, 0.0, _PARKED],
-                flags=pybullet.URDF_USE_INERTIA_FROM_FILE
-                | (0 if self._visual else pybullet.URDF_IGNORE_VISUAL_SHAPES),
-            )
-        except pybullet.error as error:  # a missing mesh, an element it cannot read
-            path = urdf_path(self.robot)
-            raise ConfigError(f"{path}: Bullet cannot load it, see above") from error
-        links = range(client.getNumJoints(body))
-        found = {client.getJointInfo(body, link)[1].decode(): link for link in links}
-        self._joints = [found[name] for name in JOINTS]
-        self._leg_of_link = {link: k // 3 for k, link in enumerate(self._joints)}
-        self._calf_links = set(self._joints[2::3])
-        # Bullet has one speed limit per body, so it gets the slowest joint's: a calf at the other
-        # joints' 30 rad/s would move its foot by more than the foot's radius in a step.
-        slowest = min(self.robot.speed_limit)
-        for link in (_TRUNK, *links):
-            client.setCollisionFilterGroupMask(body, link, _ROBOT, _GROUND)
-            client.changeDynamics(
-                body,
-                link,
-                linearDamping=0.0,
-                angularDamping=0.0,
-                jointDamping=0.0,
-                maxJointVelocity=slowest,
-            )
-            # Not in the call above: together with damping, PyBullet would set it on the trunk.
-            client.changeDynamics(body, link, lateralFriction=self.physics.friction)
-        # Switch off Bullet's default velocity motors, which would hold the joints.
-        client.setJointMotorControlArray(
-            body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * NUM_JOINTS
-        )
-        return int(body)
+    @abstractmethod
+    def retire(self, index: ArrayLike) -> None:
+        """Remove the robots ``index`` permanently; their rows of ``state`` keep the last pose and
+        velocities."""
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Make the simulator forget the contacts of earlier steps; ``state`` stays as it is.
+
+        Solvers start from the last step's contact forces. After this call the simulation continues,
+        bit for bit, as in a world rebuilt with the same ``state`` and dynamics.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free what the simulator holds; the world cannot be used afterwards."""
+
+    @abstractmethod
+    def _put(self, i: int) -> None:
+        """Set the simulator's robot ``i`` to its pose and velocities in ``state``."""
+
+    @abstractmethod
+    def _move_trunk(self, i: int) -> None:
+        """Give the trunk of robot ``i`` its velocities in ``state``."""
 
     def reset_robots(self, index: ArrayLike, position: Array, quaternion: Array, q: Array) -> None:
         """Place the robots ``index`` (n,) at rest at ``position`` (n, 3), ``quaternion`` (n, 4)
@@ -288,91 +112,6 @@ class World:
             self._put(i)
         state.derive()
 
-    def _put(self, i: int) -> None:
-        """Set Bullet's robot ``i`` to its pose and velocities in ``state``."""
-        body, client, state = self._bodies[i], self._client_of[i], self.state
-        self._place_trunk(i, state.position[i])
-        self._move_trunk(i)
-        for joint, angle, speed in zip(self._joints, state.q[i], state.qd[i], strict=True):
-            client.resetJointState(body, joint, angle, speed)
-
-    def _to_centre(self, i: int) -> Array:
-        """Vector from the trunk's origin to its centre of mass in the world frame, (3,) m."""
-        return rotation_matrix(self.state.quaternion[i : i + 1])[0] @ self._centre
-
-    def _place_trunk(self, i: int, position: Array) -> None:
-        """Move the trunk of robot ``i`` to ``position`` (3,), with its orientation in ``state``."""
-        self._client_of[i].resetBasePositionAndOrientation(
-            self._bodies[i],
-            position + self._to_centre(i),
-            quaternion_product(self.state.quaternion[i], self._axes),
-        )
-
-    def _move_trunk(self, i: int) -> None:
-        """Give the trunk of robot ``i`` its velocities in ``state``."""
-        lin_vel, ang_vel = self.state.lin_vel[i], self.state.ang_vel[i]
-        self._client_of[i].resetBaseVelocity(
-            self._bodies[i], lin_vel + np.cross(ang_vel, self._to_centre(i)), ang_vel
-        )
-
-    def _read_trunks(self, live: NDArray[np.integer]) -> None:
-        """Read the trunk poses and velocities of the robots ``live`` into ``state``."""
-        robots = [(self._bodies[i], self._client_of[i].id) for i in live]
-        poses = [pybullet.getBasePositionAndOrientation(*robot) for robot in robots]
-        speeds = [pybullet.getBaseVelocity(*robot) for robot in robots]
-        axes = np.reshape([quaternion for _, quaternion in poses], (-1, 4))
-        quaternion = quaternion_product(axes, self._axes * [-1.0, -1.0, -1.0, 1.0])
-        arm = rotation_matrix(quaternion) @ self._centre
-        ang_vel = np.reshape([angular for _, angular in speeds], (-1, 3))
-        lin_vel = np.reshape([linear for linear, _ in speeds], (-1, 3))
-        state = self.state
-        state.position[live] = np.reshape([position for position, _ in poses], (-1, 3)) - arm
-        state.quaternion[live] = quaternion
-        state.lin_vel[live] = lin_vel - np.cross(ang_vel, arm)
-        state.ang_vel[live] = ang_vel
-
-    def forget(self) -> None:
-        """Make Bullet forget the contacts of earlier steps; ``state`` stays as it is.
-
-        Bullet warm-starts its solver with the last step's contact forces. After this call the
-        simulation continues, bit for bit, as in a world rebuilt with the same ``state`` and
-        dynamics. To this end every robot spends one ``stepSimulation`` high above the ground.
-        """
-        for i in self._active:
-            self._place_trunk(int(i), self.state.position[i] + [0.0, 0.0, _PARKED])
-        for client in dict.fromkeys(self._client_of[i] for i in self._active):
-            client.stepSimulation()
-        for i in self._active:
-            self._put(int(i))
-
-    def _links_inertia(self, link: int) -> tuple[Array, Array]:
-        """A link's inertia about its principal axes, (3,) kg m^2, and the number of rotors that
-        turn about the axis closest to each, (3,): of its own joint and of those it carries."""
-        _, _, inertia, _, quaternion, *_ = self._client_of[0].getDynamicsInfo(self._bodies[0], link)
-        part = -1 if link == _TRUNK else self._joints.index(link) % 3
-        forward, leftward = [(4, 0), (1, 1), (0, 2), (0, 1)][part + 1]  # trunk, hip, thigh, calf
-        axes = np.abs(rotation_matrix(np.array([quaternion]))[0])  # one in each column
-        rotors = np.zeros(3)
-        rotors[axes[0].argmax()] += forward
-        rotors[axes[1].argmax()] += leftward
-        return np.array(inertia), rotors
-
-    def apply_dynamics(self, index: ArrayLike) -> None:
-        """Pass on changes of ``friction``, ``payload`` and ``armature`` of the robots ``index``
-        (n,) to the simulator; ``strength`` and ``joint_friction`` are read at every step."""
-        nominal = self.state.geometry.trunk_mass
-        for i in np.asarray(index):
-            body, client = self._bodies[i], self._client_of[i]
-            friction, mass = float(self.friction[i]), nominal + float(self.payload[i])
-            for link in (_TRUNK, *sorted(self._joints)):
-                client.changeDynamics(body, link, lateralFriction=friction)
-            client.changeDynamics(body, _TRUNK, mass=mass)  # first: it resets the inertia
-            for link, (inertia, rotors) in self._inertia.items():
-                # The payload is spread over the trunk, so the inertia scales with the mass.
-                grown = inertia * (mass / nominal) if link == _TRUNK else inertia
-                about = (grown + float(self.armature[i]) * rotors).tolist()
-                client.changeDynamics(body, link, localInertiaDiagonal=about)
-
     def push(self, index: ArrayLike, velocity: Array) -> None:
         """Add ``velocity`` (n, 3) m/s to the trunks of the robots ``index`` (n,), which are
         distinct, and refresh ``state``."""
@@ -382,32 +121,6 @@ class World:
             self._move_trunk(i)
         state.derive()
 
-    def retire(self, index: ArrayLike) -> None:
-        """Remove the robots ``index`` permanently; their rows of ``state`` keep the last pose and
-        velocities."""
-        for i in np.asarray(index):
-            self._client_of[i].removeBody(self._bodies[i])
-        self._active = np.setdiff1d(self._active, index)
-
-    def step(self, targets: Array, delay: Array, offset: Array) -> None:
-        """Simulate one control step of PD control.
-
-        Args:
-            targets: (H, M, 12) rad, the joint targets of this control step and the H-1 before.
-            delay: (M,) s until a target takes effect, at most H-1 control steps.
-            offset: (M, 12) rad, error of each joint's zero.
-        """
-        live, state = self._active, self.state
-        wanted = self._wanted(targets, delay, offset)
-        state.trunk_force = np.zeros(self.num_robots)
-        for client in self._clients:
-            mine = slice(*np.searchsorted(live, client.robots))
-            if live[mine].size:
-                self._step_client(client, live[mine], wanted[:, mine])
-        self._read_trunks(live)
-        state.derive()
-        self._read_contacts()
-
     def _wanted(self, targets: Array, delay: Array, offset: Array) -> Array:
         """Joint targets of the n active robots at each of k joint controls, (k, n, 12) rad: those
         of the latest control step that has taken effect by then."""
@@ -416,104 +129,6 @@ class World:
         passed = interval * np.arange(self.physics.joint_steps)[:, None]
         age = np.ceil(np.maximum(delay[live] - passed - 1e-9, 0.0) / self.physics.control_dt)
         return targets[age.astype(int), live] + offset[live]
-
-    def _step_client(self, client: _Client, live: NDArray[np.integer], wanted: Array) -> None:
-        """Run all physics steps of one client's robots ``live`` (n,), with joint targets ``wanted``
-        (k, n, 12) rad at each of k joint controls.
-
-        Clients run one after another because the CPU cache holds one of them but not all: with 50
-        robots in 5 clients, Bullet took 1.5 times as long when they alternated at every physics
-        step.
-        """
-        joints, state = self._joints, self.state
-        bodies = [self._bodies[i] for i in live]
-        dt = self.physics.hold * self.physics.dt
-        # Called for every robot and joint control; even a client's bound functions are too slow.
-        command, measure = pybullet.setJointMotorControlArray, pybullet.getJointStates
-        strength, friction = self.strength[live], self.joint_friction[live]
-        q, qd = state.q[live], state.qd[live]
-        armature = self.armature[live]
-        excess = np.where(armature[:, None] > 0.0, state.rotor_excess[live], 0.0)
-        rotors = armature.any()
-        if rotors:
-            rotation, momentum, _ = self._excess(client, bodies, q, qd)
-        for target in wanted:
-            torque = pd_torque(target - q, qd, strength, self.robot, friction)
-            applied = torque + excess[:, :NUM_JOINTS]
-            for body, forces in zip(bodies, applied.tolist(), strict=True):
-                command(
-                    body, joints, pybullet.TORQUE_CONTROL, forces=forces, physicsClientId=client.id
-                )
-            if rotors:
-                about = (rotation @ excess[:, NUM_JOINTS:, None])[..., 0].tolist()
-                for body, turn in zip(bodies, about, strict=True):
-                    pybullet.applyExternalTorque(
-                        body, _TRUNK, turn, pybullet.WORLD_FRAME, physicsClientId=client.id
-                    )
-            started = time.perf_counter()
-            client.stepSimulation()
-            self.bullet_seconds += time.perf_counter() - started
-            flat = [s for body in bodies for s in measure(body, joints, client.id)]
-            q, qd = (
-                np.fromiter(map(itemgetter(k), flat), np.float64, len(flat)).reshape(q.shape)
-                for k in (0, 1)
-            )
-            if rotors:
-                before = momentum
-                rotation, momentum, turning = self._excess(client, bodies, q, qd)
-                excess = armature[:, None] * ((momentum - before) / dt + turning)
-            pressed: dict[int, float] = {}  # row -> N on its trunk, usually empty
-            for contact in client.getContactPoints(bodyA=client.ground, linkIndexB=_TRUNK):
-                row = client.rows[contact[2]]
-                pressed[row] = pressed.get(row, 0.0) + self._force(contact)
-            for row, force in pressed.items():
-                state.trunk_force[row] = max(force, state.trunk_force[row])
-        state.q[live], state.qd[live], state.torque[live] = q, qd, torque
-        state.rotor_excess[live] = excess
-
-    def _excess(
-        self, client: _Client, bodies: list[int], q: Array, qd: Array
-    ) -> tuple[Array, Array, Array]:
-        """Rotation matrices of the trunks of ``bodies`` (n,), (n, 3, 3), and the two parts of
-        ``excess_momentum``, (n, 15) each."""
-        turned = [pybullet.getBasePositionAndOrientation(body, client.id)[1] for body in bodies]
-        ang_vel = np.array([pybullet.getBaseVelocity(body, client.id)[1] for body in bodies])
-        rotation = rotation_matrix(np.array(turned)) @ self._to_axes
-        return rotation, *excess_momentum((ang_vel[:, None] @ rotation)[:, 0], q, qd)
-
-    def _force(self, contact: tuple[Any, ...]) -> float:
-        """Normal force of a contact in N.
-
-        Bullet divides the impulse of its last internal step by the duration of all of them.
-        """
-        return float(contact[9] * self.physics.hold)
-
-    def _read_contacts(self) -> None:
-        """Read the forces of the last physics step on the feet and on the legs above them.
-
-        The foot is the end of the calf link, so a calf contact counts as the foot's when it is
-        within reach of the foot's centre. The sums are plain lists, because indexing arrays one
-        contact at a time would take longer than the rest of a step.
-        """
-        feet = self.state.foot_position.tolist()
-        foot_force = [[0.0] * 4 for _ in range(self.num_robots)]
-        leg_force = [[0.0] * 4 for _ in range(self.num_robots)]
-        reach = (self.state.geometry.foot_radius + _FOOT_REACH) ** 2
-        for client in self._clients:
-            for contact in client.getContactPoints(bodyA=client.ground):
-                force, link = self._force(contact), contact[4]
-                leg = self._leg_of_link.get(link)
-                if force <= 0.0 or leg is None:  # None is the trunk
-                    continue
-                row = client.rows[contact[2]]
-                if link in self._calf_links:
-                    (x, y, z), (fx, fy, fz) = contact[6], feet[row][leg]
-                    if (x - fx) ** 2 + (y - fy) ** 2 + (z - fz) ** 2 < reach:
-                        foot_force[row][leg] += force
-                        continue
-                leg_force[row][leg] += force
-        self.state.foot_force = np.array(foot_force)
-        self.state.leg_force = np.array(leg_force)
 
     def ground_height(self, x: Array, y: Array) -> Array:
         """Surface height in m at points ``x``, ``y``, arrays of any shape."""
@@ -527,168 +142,3 @@ class World:
         """Height of each trunk above the support surface under it, (M,) m."""
         x, y, z = self.state.position.T
         return z - self.support_height(x, y)
-
-    def picture(
-        self,
-        row: int,
-        width: int = 640,
-        height: int = 400,
-        azimuth: float = -0.9,
-        elevation: float = 0.33,
-        distance: float = 1.4,
-        target: Array | None = None,
-    ) -> NDArray[np.uint8]:
-        """Render robot ``row`` and its ground, (height, width, 3); needs no display.
-
-        The camera looks at ``target`` (3,) m, the trunk by default, from ``distance`` m away,
-        ``azimuth`` rad from the world's x axis and ``elevation`` rad above the target. The world
-        must have been created with ``visual``.
-        """
-        client = self._client_of[row]
-        target = self.state.position[row] if target is None else target
-        away = [np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]
-        eye = target + distance * np.cos(elevation) * np.array(away)
-        _, _, pixels, _, bodies = client.getCameraImage(
-            width,
-            height,
-            client.computeViewMatrix(eye.tolist(), target.tolist(), [0.0, 0.0, 1.0]),
-            client.computeProjectionMatrixFOV(45.0, width / height, 0.05, 30.0),
-            renderer=pybullet.ER_TINY_RENDERER,
-            lightDirection=[0.5, -1.0, 2.0],
-        )
-        image = np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
-        image[np.reshape(bodies, (height, width)) < 0] = _SKY  # -1: background
-        return image
-
-    def close(self) -> None:
-        """Disconnect from Bullet; the world cannot be used afterwards."""
-        for client in self._clients:
-            if client.isConnected():  # the user may have closed the window
-                client.disconnect()
-        self._clients.clear()
-
-
-class WindowError(RuntimeError):
-    """Bullet's window cannot be opened or was closed; the message is one line."""
-
-
-def check_display() -> None:
-    """Check for a display, because Bullet ends the whole process without one.
-
-    Raises:
-        WindowError: no display, or no libX11 to reach it.
-    """
-    if sys.platform != "linux":
-        return  # other systems always have one
-    name = os.environ.get("DISPLAY", "")
-    try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError as error:
-        raise WindowError("a window needs X11, and libX11.so.6 is not installed") from error
-    x11.XOpenDisplay.argtypes, x11.XOpenDisplay.restype = [ctypes.c_char_p], ctypes.c_void_p
-    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
-    display = x11.XOpenDisplay(None) if name else None
-    if not display:
-        raise WindowError(f"a window needs a display; DISPLAY='{name}' is none")
-    x11.XCloseDisplay(display)
-
-
-class Stage(World):
-    """One robot on its tile, posed rather than simulated, for films and Bullet's window.
-
-    Args:
-        robot, physics, field: as in ``World``.
-        window: open Bullet's window.
-
-    Raises:
-        WindowError: ``window`` without a display.
-    """
-
-    def __init__(
-        self, robot: RobotConfig, physics: PhysicsConfig, field: TileField, window: bool = False
-    ) -> None:
-        if window:
-            check_display()
-        super().__init__(1, robot, physics, field, visual=True, window=window)
-        self._client = self._clients[0]
-        self._sliders: list[int] = []
-        self._text = -1  # none yet
-        if window:
-            for flag in (
-                pybullet.COV_ENABLE_RGB_BUFFER_PREVIEW,
-                pybullet.COV_ENABLE_DEPTH_BUFFER_PREVIEW,
-                pybullet.COV_ENABLE_SEGMENTATION_MARK_PREVIEW,
-            ):
-                self._client.configureDebugVisualizer(flag, 0)
-            # The camera of the films: behind the robot, to its right and above.
-            self._client.resetDebugVisualizerCamera(1.8, -50.0, -29.0, [0.0, 0.0, 0.0])
-
-    def show(self, position: Array, quaternion: Array, q: Array) -> None:
-        """Place the robot at ``position`` (3,), ``quaternion`` (4,) with joint angles ``q`` (12,).
-
-        Raises:
-            WindowError: the window was closed.
-        """
-        with self._in_window():
-            self.reset_robots([0], position[None], quaternion[None], q[None])
-
-    def paint(self, texture: Path) -> None:
-        """Texture the tile with an image whose row index grows along y, its column index against
-        x."""
-        image = self._client.loadTexture(str(texture))
-        self._client.changeVisualShape(
-            self._client.ground, -1, textureUniqueId=image, rgbaColor=[1.0] * 4
-        )
-
-    def mark(self, foot: Array, colour: tuple[float, float, float]) -> None:
-        """Add a pole with a ball on top, 0.8 m tall, that stands at ``foot`` (3,) m."""
-        for kind, height, size in (
-            (pybullet.GEOM_CYLINDER, 0.4, {"radius": 0.015, "length": 0.8}),
-            (pybullet.GEOM_SPHERE, 0.8, {"radius": 0.06}),
-        ):
-            shape = self._client.createVisualShape(kind, rgbaColor=[*colour, 1.0], **size)
-            self._client.createMultiBody(0.0, -1, shape, basePosition=foot + [0.0, 0.0, height])
-
-    # ------------------------------------------------------------------ the window
-
-    def add_slider(self, name: str, low: float, high: float, start: float) -> None:
-        """Add a slider to the window or, if ``low`` is above ``high``, a button that counts its
-        clicks."""
-        self._sliders.append(self._client.addUserDebugParameter(name, low, high, start))
-
-    def read_sliders(self) -> Array:
-        """Values of all sliders, in the order in which they were added.
-
-        Raises:
-            WindowError: the window was closed.
-        """
-        with self._in_window():
-            return np.array([self._client.readUserDebugParameter(i) for i in self._sliders])
-
-    def follow(self, text: str) -> None:
-        """Point the window's camera at the robot from the current distance and direction, and
-        write ``text`` above the robot.
-
-        Raises:
-            WindowError: the window was closed.
-        """
-        position, black = self.state.position[0], [0.0, 0.0, 0.0]
-        with self._in_window():
-            yaw, pitch, distance = self._client.getDebugVisualizerCamera()[8:11]
-            self._client.resetDebugVisualizerCamera(distance, yaw, pitch, position.tolist())
-            # Bullet writes to the right of this place, so it is to the left of the robot.
-            turn, away = np.radians(yaw), 0.35 * distance
-            place = position + [-away * np.cos(turn), -away * np.sin(turn), 0.35]
-            self._text = self._client.addUserDebugText(
-                text, place.tolist(), black, 1.0, replaceItemUniqueId=self._text
-            )
-
-    @contextlib.contextmanager
-    def _in_window(self) -> Iterator[None]:
-        """Raise a ``WindowError`` for Bullet's errors in the block, if the window was closed."""
-        try:
-            yield
-        except pybullet.error as error:
-            if self._client.isConnected():
-                raise
-            raise WindowError("the window was closed") from error

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tdgc.config import HighLevelConfig
 from tdgc.policies import Policy
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, default_command, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
@@ -116,7 +117,8 @@ class NavigationTask:
         self.tiles.draw(np.arange(self.num_robots), self.curriculum.levels)
         c, m = self.low_config, self.num_robots
         noise = Noise(self.config.randomisation, self.rng) if self.training else None
-        self.locomotion = Locomotion(m, c.robot, c.physics, self.field, c.gyro, self._visual)
+        self.world = BulletWorld(m, c.robot, c.physics, self.field, self._visual)
+        self.locomotion = Locomotion(self.world, c)
         self._executor = Executor(self.locomotion, self.low, noise)
         self._observer = HighObserver(self.locomotion, self.config, noise)
 
@@ -131,7 +133,7 @@ class NavigationTask:
             self.curriculum.levels[index] = levels - 1  # a resumed run may have had others
         changed = self.tiles.begin(index, self.curriculum.levels)
         if changed.size:
-            self.locomotion.world.upload_terrain(changed)
+            self.world.upload_terrain(changed)
         starts, goals = draw_start_goal(rng, (n,))
         self.goal[index] = goals + self._origin[index]
         self.elapsed[index] = 0
@@ -162,7 +164,7 @@ class NavigationTask:
 
     def restart(self) -> None:
         """End every episode, draw new tiles and rebuild the world from scratch."""
-        self.locomotion.world.close()
+        self.world.close()
         self._build_robots()
         self.reset(np.arange(self.num_robots))
 
@@ -272,7 +274,7 @@ class NavigationTask:
 
     def forget(self) -> None:
         """Make what follows depend on ``state_dict`` alone, see ``World.forget``."""
-        self.locomotion.world.forget()
+        self.world.forget()
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """State of the episodes under way, not copied."""
@@ -327,7 +329,7 @@ class NavigationTask:
         episodes = state["episodes"]
         fill(self._arrays(), episodes)
         self.tiles.load_state_dict(episodes["tiles"])
-        self.locomotion.world.upload_terrain()
+        self.world.upload_terrain()
         self.locomotion.load_state_dict(episodes["locomotion"])
         if self.teacher is not None:
             self.teacher.begin(np.arange(self.num_robots), self.goal, self._expects())
@@ -335,7 +337,7 @@ class NavigationTask:
 
     def close(self) -> None:
         """Disconnect from Bullet."""
-        self.locomotion.world.close()
+        self.world.close()
 
 
 class NavigationEnv(TaskEnv):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tdgc.config import CommandRanges, LowLevelConfig
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
@@ -339,7 +340,7 @@ def measure_landing(low: "Policy", config: LowLevelConfig, speed: float) -> Land
     Returns:
         The landing; None for a policy that cannot leap, with most robots fallen.
     """
-    loco = Locomotion(_ROBOTS, config.robot, config.physics, None, config.gyro)
+    loco = Locomotion(BulletWorld(_ROBOTS, config.robot, config.physics), config)
     rows, dt = np.arange(_ROBOTS), config.physics.control_dt
     stride = np.linspace(0.32, LONGEST, _ROBOTS)
     loco.command[:, INDEX["vx"]] = speed = min(speed, config.commands.vx[1])

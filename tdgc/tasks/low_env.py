@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tdgc.config import LowLevelConfig
 from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.worker import Task
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, gait_index
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
@@ -105,9 +106,8 @@ class LowLevelTask:
         if self.tiles is not None:
             self.tiles.draw(everyone, self.level)
             self.crossings.look(self.tiles.field, everyone)
-        self.locomotion = Locomotion(
-            self.num_robots, c.robot, c.physics, self.field, c.gyro, self._visual
-        )
+        self.world = BulletWorld(self.num_robots, c.robot, c.physics, self.field, self._visual)
+        self.locomotion = Locomotion(self.world, c)
         self.ground = measure_ground(self.locomotion)
 
     # ------------------------------------------------------------------ episodes
@@ -134,7 +134,7 @@ class LowLevelTask:
             return xy, rng.uniform(-np.pi, np.pi, n)
         changed = self.tiles.begin(index, self.level)
         if changed.size:
-            self.locomotion.world.upload_terrain(changed)
+            self.world.upload_terrain(changed)
             self.crossings.look(self.tiles.field, changed)
         origin = self.tiles.field.origin(index)
         start, goal = draw_start_goal(rng, (n,))
@@ -157,7 +157,7 @@ class LowLevelTask:
     def restart(self) -> None:
         """End every episode, redraw the terrain and rebuild the world from scratch, as at the start
         of a run."""
-        self.locomotion.world.close()
+        self.world.close()
         self._build()
         self.commands.scores[:] = 0.0
         everyone, e = np.arange(self.num_robots), self.episodes
@@ -208,7 +208,7 @@ class LowLevelTask:
 
     def _move_levels(self, failed: NDArray[np.bool_], ended: NDArray[np.bool_]) -> None:
         e = self.episodes
-        x = self.locomotion.world.state.position[:, 0] - e.origin[:, 0]
+        x = self.world.state.position[:, 0] - e.origin[:, 0]
         tried = failed | (e.elapsed - e.began >= self.horizon)
         self.level = self.crossings.move(self.level, x, ended, tried)
 
@@ -295,12 +295,12 @@ class LowLevelTask:
             stats |= {
                 "leapers": 1.0, "landing/front": landing.front, "landing/spread": landing.spread
             }  # fmt: skip
-        stats["bullet_seconds"] = self.locomotion.world.bullet_seconds
+        stats["bullet_seconds"] = self.world.bullet_seconds
         return stats
 
     def forget(self) -> None:
         """Make what follows depend on ``state_dict`` alone, see ``World.forget``."""
-        self.locomotion.world.forget()
+        self.world.forget()
 
     def _learned(self) -> dict[str, NDArray[Any]]:
         return {
@@ -347,13 +347,13 @@ class LowLevelTask:
         if self.tiles is not None:
             self.tiles.load_state_dict(episodes["tiles"])
             self.crossings.plan(self.tiles.field, np.arange(self.num_robots))
-            self.locomotion.world.upload_terrain()
+            self.world.upload_terrain()
         self.locomotion.load_state_dict(episodes["locomotion"])
         self.ground = measure_ground(self.locomotion)
 
     def close(self) -> None:
         """Disconnect from Bullet."""
-        self.locomotion.world.close()
+        self.world.close()
 
 
 def make_task(

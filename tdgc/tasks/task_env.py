@@ -64,7 +64,7 @@ class TaskEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self.render_mode is not None
 
     def render(self) -> NDArray[np.uint8] | None:
-        return self.task.locomotion.world.picture(0) if self._rendered else None
+        return self.task.world.picture(0) if self._rendered else None
 
     def close(self) -> None:
         self.task.close()
