@@ -186,7 +186,7 @@ def test_another_robot_is_refused(
 ) -> None:
     urdf = tmp_path / "other.urdf"
     urdf.write_text((folder / "quadruped.urdf").read_text().replace(old, new))
-    with pytest.raises(ExportError, match=f"not the exported robot's URDF.*{message}"):
+    with pytest.raises(ExportError, match=f"not the exported robot's URDF.*{message}.*; use that one, or"):
         controller.robot(urdf)
 
 

@@ -182,17 +182,29 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(damage: Any, tmp_path
     warnings: list[str] = []
     assert Checkpoint.newest(tmp_path, warnings.append).header["at"] == 10
     assert len(warnings) == 1 and str(newest) in warnings[0]
-    assert warnings[0].endswith("; trying the one before")
+    assert warnings[0].endswith("; going on from step-000000000010")
     Checkpoint.read(before).drop_later(tmp_path / "checkpoints")  # as when a run goes on from it
     assert sorted(newest.parent.glob("step-*")) == [before]
     damage(before)
-    with pytest.raises(CheckpointError, match=r"no checkpoint that can be read$"):
+    with pytest.raises(CheckpointError, match=str(before)) as caught:
         Checkpoint.newest(tmp_path, warnings.append)
+    assert "\n" not in str(caught.value) and len(warnings) == 1
 
 
 def test_no_checkpoint_at_all(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"no checkpoint that can be read$"):
+    with pytest.raises(CheckpointError, match=r": no checkpoint$"):
         Checkpoint.newest(tmp_path, print)
+
+
+def test_a_run_of_another_version_is_refused_in_one_line_that_says_what_to_do(
+    tmp_path: Path,
+) -> None:
+    for checkpoint in three(tmp_path):
+        newer(checkpoint)
+    warnings: list[str] = []
+    with pytest.raises(CheckpointError, match=r"a new run can begin .* with --init$") as caught:
+        Checkpoint.newest(tmp_path, warnings.append)
+    assert "\n" not in str(caught.value) and not warnings
 
 
 def test_a_checkpoint_of_another_network(tmp_path: Path) -> None:
@@ -753,7 +765,7 @@ def test_flags_and_folders_that_cannot_be_used(
             "--out",
             str(empty),
         ],
-        f"{used}: no checkpoint that can be read": ["--resume", "--out", str(used)],
+        f"{used}: no checkpoint": ["--resume", "--out", str(used)],
         "unknown configuration key 'env.robot.kq'": ["--set", "env.robot.kq=1"],
         "cannot read --set 'seed'": ["--set", "seed"],
         "not a JSON file": ["--resume", "--out", str(damaged)],

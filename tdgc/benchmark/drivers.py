@@ -116,11 +116,10 @@ class TeacherDriver(Driver):
         self.config = HighLevelConfig(cues="none", commands=self.bounds)
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
-        self._loco, self._goal, self.told = loco, goal, family
+        self._loco, self._goal = loco, goal
         assert loco.world.field is not None  # episodes run on tiles
         self._teacher = Teacher(loco.world.field, self.bounds, self._skill)
-        expects = np.full(loco.num_robots, family == "gap")
-        self._teacher.begin(np.arange(loco.num_robots), goal, expects)
+        self._teacher.begin(np.arange(loco.num_robots), goal)
 
     def command(self, step: int) -> Array:
         decision, held = divmod(step, self.config.decimation)

@@ -397,18 +397,25 @@ class Controller:
         geometry, table = read_geometry(config), self.low.table
         limits = table["joint_control"]["joint_limits"]
         told = np.column_stack([limits["low"], limits["high"]])
-        wrong = f"{urdf}: not the exported robot's URDF, {table['robot']['urdf']['file']}"
+
+        def refused(difference: str) -> ExportError:
+            file = table["robot"]["urdf"]["file"]
+            return ExportError(
+                f"{urdf}: not the exported robot's URDF, {file}: {difference}; use that one, or "
+                "export the pair again"
+            )
+
         for joint, mine, wanted in zip(JOINTS, geometry.joint_limits, told, strict=True):
             if not np.array_equal(mine, wanted):
                 ends = [f"from {low:g} to {high:g} rad" for low, high in (mine, wanted)]
-                raise ExportError(f"{wrong}: {joint} turns {ends[0]}, that robot's {ends[1]}")
+                raise refused(f"{joint} turns {ends[0]}, that robot's {ends[1]}")
         masses = table["robot"]["link_masses"]["value"]
         for link in (*masses, *geometry.masses):
             mine, wanted = geometry.masses.get(link, 0.0), masses.get(link, 0.0)
             if mine != wanted:
-                raise ExportError(f"{wrong}: link {link} has {mine:g} kg, that robot's {wanted:g}")
+                raise refused(f"link {link} has {mine:g} kg, that robot's {wanted:g}")
         height, wanted = nominal_height(config, geometry), table["start"]["trunk_height"]["value"]
         if not np.isclose(height, wanted, rtol=0.0, atol=1e-9):
-            raise ExportError(f"{wrong}: starts {height:g} m high, that robot {wanted:g}")
+            raise refused(f"starts {height:g} m high, that robot {wanted:g}")
         if checksum(urdf) != table["robot"]["urdf"]["sha256"]:
-            raise ExportError(f"{wrong}: joint limits and masses agree, its checksum does not")
+            raise refused("joint limits and masses agree, its checksum does not")

@@ -279,21 +279,25 @@ class LowGraph(nn.Module):
         known = np.column_stack([np.ones(len(GAITS)), GAIT_TABLE])
         first, *gain = np.linalg.solve(known, np.arange(len(GAITS)) / (len(GAITS) - 1))
         self.gait_zero, self.gait_gain = _constant([first]), _constant(gain)
-        asked = "to follow in this step"
+        asked = "commands to follow in this step"
         self.inputs = [
             *_BODY,
             *([_GYRO] if config.gyro else []),
             Signal("last_action", NUM_JOINTS, "1", "the last action", "joints", "action", 0.0),
-            Signal("action_before", NUM_JOINTS, "1", "before that", "joints", "last_action", 0.0),
+            Signal(
+                "action_before", NUM_JOINTS, "1", "the one before", "joints", "last_action", 0.0
+            ),
             Signal("commands", NUM_COMMANDS, None, asked, "commands", source="high.commands"),
             Signal("clock", 1, "1", "share of the gait cycle, in [0, 1)", None, "next_clock", 0.0),
         ]
         if self.counted:
             first = tuple(default_command().tolist())
-            form = (NUM_COMMANDS, None, "the last", "commands", "commands", first)
+            form = (NUM_COMMANDS, None, "those of the previous step", "commands", "commands", first)
             self.inputs += [
                 Signal("last_commands", *form),
-                Signal("cycles", 1, "1", "of the gait since it began", None, "next_cycles", 0.0),
+                Signal(
+                    "cycles", 1, "1", "gait cycles since this gait began", None, "next_cycles", 0.0
+                ),
             ]
         self.outputs = [
             Signal("action", NUM_JOINTS, "1", "within its limits", "joints"),
@@ -301,7 +305,9 @@ class LowGraph(nn.Module):
             Signal("next_clock", 1, "1", "share of the gait cycle at the end of this step"),
         ]
         if self.counted:
-            self.outputs += [Signal("next_cycles", 1, "1", "of the gait so far, after this step")]
+            self.outputs += [
+                Signal("next_cycles", 1, "1", "gait cycles since this gait began, after this step")
+            ]
 
     def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
         """``inputs`` -> ``outputs``."""
@@ -349,10 +355,26 @@ def _high_inputs(seconds: float) -> list[Signal]:
     start = tuple(default_command().tolist())
     return [
         Signal("goal", 2, "m", goal),
-        Signal("time_left", 1, "s", f"of {seconds:g} s"),
+        Signal("time_left", 1, "s", f"left of the episode's {seconds:g} s"),
         *_BODY,
-        Signal("last_decision", NUM_ACTIONS, "1", "the last", "decision", "decision", 0.0),
-        Signal("last_commands", NUM_COMMANDS, None, "the last", "commands", "commands", start),
+        Signal(
+            "last_decision",
+            NUM_ACTIONS,
+            "1",
+            "the last decision, not clipped",
+            "decision",
+            "decision",
+            0.0,
+        ),
+        Signal(
+            "last_commands",
+            NUM_COMMANDS,
+            None,
+            "those of the last decision",
+            "commands",
+            "commands",
+            start,
+        ),
         Signal("clock", 1, "1", clock, start=0.0, source="low.next_clock"),
     ]
 
@@ -405,7 +427,13 @@ class HighGraph(nn.Module):
             *(Signal(k, size, "1", what, None, f"next_{k}", 0.0) for k, what in state.items()),
         ]
         self.outputs = [
-            Signal("decision", NUM_ACTIONS, "1", "raw actions", "decision"),
+            Signal(
+                "decision",
+                NUM_ACTIONS,
+                "1",
+                "raw actions, before clipping and decoding",
+                "decision",
+            ),
             Signal("commands", NUM_COMMANDS, None, "for the low policy", "commands"),
             *(Signal(f"next_{k}", size, "1", what) for k, what in state.items()),
         ]

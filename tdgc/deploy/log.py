@@ -223,7 +223,7 @@ def _mistimed(time: Array, dt: float) -> str | None:
     for k in np.flatnonzero((later <= 0.0) | (later > (2.0 - _PUNCTUAL) * dt)):
         return (
             f"a gap at {time[k]:.2f} s, where the next row is {later[k]:.3f} s later and not "
-            f"{dt:g} s"
+            f"{dt:g} s: log every control step"
         )
     return None
 
@@ -239,7 +239,10 @@ def _gap(log: Log, controller: Controller) -> str | None:
         for name in (name for name in names if name in log.values):
             empty = rows[~np.isfinite(log.values[name][rows]).all(axis=1)]
             if empty.size:
-                return f"a gap at {time[empty[0]]:.2f} s: no {name}"
+                return (
+                    f"a gap at {time[empty[0]]:.2f} s: no {name}; where none has arrived, log the "
+                    "one that the graphs were given"
+                )
     if not log.decisions.size:
         return "has no decision"
     task, due = controller.high.table["task"], _due(log, controller)

@@ -30,7 +30,7 @@ from tdgc.files import write_synced
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and the one before in case that is damaged
-_VERSION = 13  # to be raised when the state of a run changes: other versions are refused
+_VERSION = 14  # to be raised when the state of a run changes: other versions are refused
 #: Tensor names of the recurrent learner's LSTM states in the current episodes.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
@@ -95,9 +95,13 @@ class Checkpoint:
         try:
             data = (path / "state.safetensors").read_bytes()
             header = json.loads((path / "state.json").read_bytes())
-            known = isinstance(header, dict) and header.get("format") == "tdgc-checkpoint"
-            if not known or header.get("version") != _VERSION:
-                raise CheckpointError(f"{path}: not a tdgc checkpoint of version {_VERSION}")
+            if not isinstance(header, dict) or header.get("format") != "tdgc-checkpoint":
+                raise CheckpointError(f"{path}: not a tdgc checkpoint")
+            if header.get("version") != _VERSION:
+                raise CheckpointError(
+                    f"{path}: its format version is {header.get('version')!r}, this code reads "
+                    f"{_VERSION}; a new run can begin from the run's policy, with --init"
+                )
             for counter in ("num_timesteps", "n_updates"):
                 if type(header.get(counter)) is not int or not 0 <= header[counter] < 2**63:
                     raise CheckpointError(f"{path}: '{counter}' is not a count")
@@ -111,17 +115,22 @@ class Checkpoint:
 
     @classmethod
     def newest(cls, run: Path, warn: Callable[[str], None]) -> "Checkpoint":
-        """Read the newest readable checkpoint of a run, skipping others with a warning.
+        """Read the newest readable checkpoint of a run; warn if it is not the newest.
 
         Raises:
             CheckpointError: the run has no readable checkpoint.
         """
+        problem: CheckpointError | None = None
         for path in sorted((run / "checkpoints").glob("step-*"), reverse=True):
             try:
-                return cls.read(path)
+                found = cls.read(path)
             except CheckpointError as error:
-                warn(f"{error}; trying the one before")
-        raise CheckpointError(f"{run}: no checkpoint that can be read")
+                problem = problem or error
+            else:
+                if problem is not None:
+                    warn(f"{problem}; going on from {path.name}")
+                return found
+        raise problem or CheckpointError(f"{run}: no checkpoint")
 
     def save(self, folder: Path) -> Path:
         """Write the checkpoint to ``folder`` atomically and delete all but the newest two.

@@ -24,6 +24,10 @@ from tdgc.sim.terrain import CELL, TileField
 from tdgc.sim.urdf import JOINTS, urdf_path
 from tdgc.sim.world import World
 
+# Otherwise MuJoCo writes to MUJOCO_LOG.TXT in the working folder that a simulation diverges, which
+# the closed loop notices by itself.
+mujoco.set_mju_user_warning(lambda _: None)
+
 _CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
 _NAME = "ground"
 _BASE = 0.5  # m of ground below its lowest point: MuJoCo's height fields are solid

@@ -150,13 +150,9 @@ class NavigationTask:
         )
         self._observer.begin(index, self.goal)
         if self.teacher is not None:
-            self.teacher.begin(index, self.goal, self._expects())
+            self.teacher.begin(index, self.goal)
             share = 1.0 - self._decisions[0] / self._lead if self._lead else 0.0
             self._led[index] = rng.uniform(size=n) < share
-
-    def _expects(self) -> NDArray[np.bool_]:
-        """Which robots are told that there are trenches on their tile, (M,)."""
-        return self.family_index == semantic_index("gap")
 
     def _width(self) -> Array:
         """Scale of each robot's disturbances, (M,), growing with its level from 0 to 1."""
@@ -332,7 +328,7 @@ class NavigationTask:
         self.world.upload_terrain()
         self.locomotion.load_state_dict(episodes["locomotion"])
         if self.teacher is not None:
-            self.teacher.begin(np.arange(self.num_robots), self.goal, self._expects())
+            self.teacher.begin(np.arange(self.num_robots), self.goal)
             self.teacher.speed[:] = episodes["speed"]
 
     def close(self) -> None:

@@ -2,12 +2,11 @@
 
 It knows what the high policy has to infer from its cues: where the robot is on the tile, how fast
 it moves, and the heights of the tile. From these it reads obstacles, trenches and slopes
-(``tdgc.tasks.survey``), so it leads on any terrain, a family or a user's map. It is told only
-whether the high policy expects trenches, and then leaps from the start. Its styles were found with
-the shipped low policy (docs/experiments.md); how fast to walk, step and leap is found anew for each
-low policy (``tdgc.tasks.manners``). Leaps over trenches show why imitation comes first:
-they take pronk at nearly full speed with steps timed to a few centimetres, which exploration that
-starts from a trot does not find.
+(``tdgc.tasks.survey``) and is told nothing else, so it leads on any terrain, a family or a user's
+map. Its styles were found with the shipped low policy (docs/experiments.md); how fast to walk, step
+and leap is found anew for each low policy (``tdgc.tasks.manners``). Leaps over trenches show why
+imitation comes first: they take pronk at nearly full speed with steps timed to a few centimetres,
+which exploration that starts from a trot does not find.
 """
 
 from dataclasses import dataclass, replace
@@ -112,7 +111,7 @@ class Skill:
         return replace(self.uneven, speed=5.0 * self.manner.walk_speed / 6.0)
 
 
-#: m ahead at which the probes see a trench; they reach 1.2 m.
+#: m before a trench at which leaps begin, since the probes, which reach 1.2 m, show it there.
 SIGHT = 1.15
 
 # Weight of a newly seen speed in the estimate, chosen by hand: it oscillates within a gait cycle.
@@ -183,21 +182,19 @@ class Teacher:
         self._careful = skill.among_obstacles.speed
         self._plan = LeapPlan(m, ranges, speed=self._wanted_speed)
         self._leap_speed = min(self._wanted_speed, ranges.vx[1])
-        self._start = np.full(m, -np.inf)  # m, x where a robot starts to leap
+        self._start = np.full(m, np.inf)  # m, x where a robot starts to leap
         self._end = np.full(m, -np.inf)  # m, x where a robot stops leaping
 
-    def begin(self, index: NDArray[np.integer], goal: Array, expects: NDArray[np.bool_]) -> None:
+    def begin(self, index: NDArray[np.integer], goal: Array) -> None:
         """Plan leaps and ways around obstacles on the tiles of the robots ``index`` (n,).
 
         Args:
             index: the robots.
             goal: (M, 2) m in the world.
-            expects: (M,) robots whose high policy is told that there are trenches. They leap from
-                the start; others begin ``SIGHT`` m before the first trench, when they can see it.
         """
         field, n = self._field, TILE_SAMPLES
         self.speed[index] = 0.0
-        self._start[index] = self._end[index] = -np.inf
+        self._start[index], self._end[index] = np.inf, -np.inf
         for i in index.tolist():
             heights = field.heights[i * n : (i + 1) * n]
             found = survey(heights, field.crop, goal[i] - self._origin[i])
@@ -207,7 +204,7 @@ class Teacher:
                 self._costs[i] = found.cost
             if self._landing is not None and len(found.trenches):
                 self._plan.look(i, found.trenches, self._landing.spread)
-                self._start[i] = -np.inf if expects[i] else found.trenches[0, 0] - SIGHT
+                self._start[i] = found.trenches[0, 0] - SIGHT
                 self._end[i] = found.trenches[-1, 1] + BEYOND
 
     def watch(self, loco: Locomotion, seconds: float) -> None:
