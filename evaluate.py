@@ -25,12 +25,12 @@ from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, Teac
 from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, plan, run_cell
 from tdgc.benchmark.flags import add_arguments, choose, resolve
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import FAILURES, describe, make_room, salvage, write_results
+from tdgc.benchmark.results import describe, make_room, salvage, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
-from tdgc.errors import InputError, interruptible, require, what_stopped
+from tdgc.errors import InputError, require, script
 from tdgc.files import make_folder, write_json
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
@@ -39,7 +39,6 @@ from tdgc.parallel.jobs import RunJobs, run_jobs
 from tdgc.policies import Policy
 from tdgc.show import film, gui, plots, report
 from tdgc.sim.bullet_world import BulletWorld
-from tdgc.sim.display import WindowError
 from tdgc.sim.geometry import read_geometry
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.manners import find_manner, manner_of
@@ -443,37 +442,23 @@ def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver
         pass  # equivalent to closing the window
 
 
-@interruptible("evaluate.py")
+@script("evaluate.py")
 def main(arguments: list[str] | None = None) -> int:
-    def fail(error: object) -> None:
-        print(f"evaluate.py: {error}", file=sys.stderr)
-
-    try:
-        evaluation = Evaluation.of(parse(arguments))
-        low, config = load_low(evaluation.low)
-        # Fail before earlier results are removed.
-        BulletWorld(1, config.robot, config.physics).close()
-        drivers = evaluation.drivers(low, config)
-        evaluation.make_room()
-    except (ValueError, OSError) as error:
-        fail(error)
-        return 2
+    evaluation = Evaluation.of(parse(arguments))
+    low, config = load_low(evaluation.low)
+    # Fail before earlier results are removed.
+    BulletWorld(1, config.robot, config.physics).close()
+    drivers = evaluation.drivers(low, config)
+    evaluation.make_room()
     problems: list[str] = []
-    try:
-        if evaluation.mode == "tracking":
-            run_tracking(evaluation, low)
-        elif evaluation.mode == "table":
-            problems = run_table(evaluation, low, drivers)
-        else:
-            run_window(evaluation, low, drivers)
-    except (InputError, WindowError) as error:  # no robot, terrain or window where it is needed
-        fail(what_stopped(error))
-        return 2
-    except FAILURES as error:
-        fail(what_stopped(error))
-        return 1
+    if evaluation.mode == "tracking":
+        run_tracking(evaluation, low)
+    elif evaluation.mode == "table":
+        problems = run_table(evaluation, low, drivers)
+    else:
+        run_window(evaluation, low, drivers)
     for problem in problems:
-        fail(problem)
+        print(f"evaluate.py: {problem}", file=sys.stderr)
     return 1 if problems else 0
 
 

@@ -31,15 +31,14 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.errors import interruptible, what_stopped
-from tdgc.files import checksum
-from tdgc.learn.flags import Machine, add_arguments, configure, make_run_folder
+from tdgc.errors import script
+from tdgc.files import checksum, make_folder
+from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, check_batch, shared_keywords
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, MemoryExchange
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
-from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Policy
 from tdgc.policies.files import files_of
 from tdgc.policies.learning import MirroredHead
@@ -345,7 +344,7 @@ def check(config: HighTrainConfig, control_dt: float) -> None:
     start_action(config)
 
 
-@interruptible("train_high.py")
+@script("train_high.py")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_arguments(parser, "runs/high", HighTrainConfig(), "decisions")
@@ -367,43 +366,39 @@ def main(arguments: list[str] | None = None) -> int:
         preset += ("imitation.steps=0",)  # imitation would overwrite what that policy has learned
     if args.low is not None:
         args.assignments.append(f"low={json.dumps(args.low)}")
-    try:
-        if args.resume and (args.no_teacher or PRESETS[args.preset]):
-            raise ConfigError("--resume keeps the run's settings: no --preset or --no-teacher")
-        start = with_overrides(HighTrainConfig(), preset)
-        config = configure(start if args.resume else with_low(start, args.assignments), args)
-        path = find_low() if config.low is None else config.low
-        low, low_config = load_low(path)
-        config = pin_low(config, path)
-        taught = config.imitation.steps or args.init is not None or args.resume
-        if config.imitation.teacher is not None and not taught:
-            raise ConfigError("'imitation.teacher' has no effect without imitation")
-        tqdm.write(f"low policy: {path}")
-        check_robot(low_config.robot, low_config.physics, config.env.randomisation)
-        config = dataclasses.replace(config, env=paired(config.env, low_config))
-        check(config, low_config.physics.control_dt)
-        if missing := left_out(config.env.families, config.n_envs):
-            tqdm.write(f"too few robots for all families: none is on {', '.join(missing)}")
-        make_run_folder(args.out)
-        interruption = Interruption(args.time_limit)
-        config = with_manner(config, low, args.init)
-        meta: dict[str, Any] = {
-            "config": to_dict(config.env),
-            "low": {"config": to_dict(low_config), "observation": low.actor_dim},
-            "seed": config.seed,
-            "code": __version__,
-            "benchmark": EDITION,
-        }
-        if config.imitation.teacher is not None:
-            meta["teacher"] = to_dict(config.imitation.teacher)
-        run = Run(args.out, config, meta, summarise, interruption, args.init)
-        run.train(phases(config, low, Machine.of(args)), args.resume)
-        log = args.out / "log.jsonl"
-        if log.exists():
-            plots.decision_curve(log, args.out / "training.png")
-    except (ValueError, WorkerError, OSError) as error:
-        print(f"train_high.py: {what_stopped(error)}", file=sys.stderr)
-        return 2 if isinstance(error, ValueError) else 1
+    if args.resume and (args.no_teacher or PRESETS[args.preset]):
+        raise ConfigError("--resume keeps the run's settings: no --preset or --no-teacher")
+    start = with_overrides(HighTrainConfig(), preset)
+    config = configure(start if args.resume else with_low(start, args.assignments), args)
+    path = find_low() if config.low is None else config.low
+    low, low_config = load_low(path)
+    config = pin_low(config, path)
+    taught = config.imitation.steps or args.init is not None or args.resume
+    if config.imitation.teacher is not None and not taught:
+        raise ConfigError("'imitation.teacher' has no effect without imitation")
+    tqdm.write(f"low policy: {path}")
+    check_robot(low_config.robot, low_config.physics, config.env.randomisation)
+    config = dataclasses.replace(config, env=paired(config.env, low_config))
+    check(config, low_config.physics.control_dt)
+    if missing := left_out(config.env.families, config.n_envs):
+        tqdm.write(f"too few robots for all families: none is on {', '.join(missing)}")
+    make_folder(args.out)
+    interruption = Interruption(args.time_limit)
+    config = with_manner(config, low, args.init)
+    meta: dict[str, Any] = {
+        "config": to_dict(config.env),
+        "low": {"config": to_dict(low_config), "observation": low.actor_dim},
+        "seed": config.seed,
+        "code": __version__,
+        "benchmark": EDITION,
+    }
+    if config.imitation.teacher is not None:
+        meta["teacher"] = to_dict(config.imitation.teacher)
+    run = Run(args.out, config, meta, summarise, interruption, args.init)
+    run.train(phases(config, low, Machine.of(args)), args.resume)
+    log = args.out / "log.jsonl"
+    if log.exists():
+        plots.decision_curve(log, args.out / "training.png")
     return 0
 
 

@@ -29,13 +29,13 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.errors import StoppedError, interruptible, what_stopped
-from tdgc.learn.flags import Machine, add_arguments, configure, make_run_folder
+from tdgc.errors import StoppedError, script
+from tdgc.files import make_folder
+from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.ppo import NoiseScaledRate, check_batch, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import TaskVecEnv
-from tdgc.parallel.worker import WorkerError
 from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.show import plots
 from tdgc.sim.locomotion import actor_layout, check_robot
@@ -196,36 +196,32 @@ def build(
     return model, env
 
 
-@interruptible("train_low.py")
+@script("train_low.py")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_arguments(parser, "runs/low", LowTrainConfig(), "control steps")
     args = parser.parse_args(arguments)
-    try:
-        config = configure(LowTrainConfig(), args)
-        if not args.resume:
-            config = fit(config, args.assignments)
-        check(config)
-        on_tiles = config.n_envs - math.floor(config.plane_share * config.n_envs)
-        if missing := left_out(config.env.families, on_tiles):
-            tqdm.write(f"too few robots for all families: none is on {', '.join(missing)}")
-        meta = {
-            "config": to_dict(config.env),
-            "seed": config.seed,
-            "code": __version__,
-            "benchmark": EDITION,
-        }
-        make_run_folder(args.out)
-        interruption = Interruption(args.time_limit)
-        run = Run(args.out, config, meta, summarise, interruption, args.init)
-        calibrating = functools.partial(finish, args.out, config, interruption)
-        run.train(phases(config, Machine.of(args)), args.resume, calibrating)
-        log = args.out / "log.jsonl"
-        if log.exists():
-            plots.training_curve(log, args.out / "training.png")
-    except (ValueError, WorkerError, OSError) as error:
-        print(f"train_low.py: {what_stopped(error)}", file=sys.stderr)
-        return 2 if isinstance(error, ValueError) else 1
+    config = configure(LowTrainConfig(), args)
+    if not args.resume:
+        config = fit(config, args.assignments)
+    check(config)
+    on_tiles = config.n_envs - math.floor(config.plane_share * config.n_envs)
+    if missing := left_out(config.env.families, on_tiles):
+        tqdm.write(f"too few robots for all families: none is on {', '.join(missing)}")
+    meta = {
+        "config": to_dict(config.env),
+        "seed": config.seed,
+        "code": __version__,
+        "benchmark": EDITION,
+    }
+    make_folder(args.out)
+    interruption = Interruption(args.time_limit)
+    run = Run(args.out, config, meta, summarise, interruption, args.init)
+    calibrating = functools.partial(finish, args.out, config, interruption)
+    run.train(phases(config, Machine.of(args)), args.resume, calibrating)
+    log = args.out / "log.jsonl"
+    if log.exists():
+        plots.training_curve(log, args.out / "training.png")
     return 0
 
 

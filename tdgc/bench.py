@@ -33,13 +33,13 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.logger import Logger
 
 from tdgc.config import HighTrainConfig, LowLevelConfig, LowTrainConfig
-from tdgc.errors import InputError, interruptible, what_stopped
+from tdgc.errors import InputError, script
 from tdgc.files import make_folder, write_json
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
-from tdgc.parallel.worker import MakeLink, ProcessLink, WorkerError, memory_mb
+from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
@@ -351,7 +351,7 @@ def choose_workers(args: argparse.Namespace) -> int:
     return workers
 
 
-@interruptible("tdgc.bench")
+@script("tdgc.bench")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.bench", description=(__doc__ or "").partition("\n")[0]
@@ -378,26 +378,18 @@ def main(arguments: list[str] | None = None) -> int:
         "--out", type=Path, default=Path("runs/bench"), help="results folder (runs/bench)"
     )
     args = parser.parse_args(arguments)
-    try:
-        check_flags(args)
-        args.workers = choose_workers(args)
-        make_folder(args.out)
-    except (InputError, OSError) as error:
-        print(f"tdgc.bench: {error}", file=sys.stderr)
-        return 2
-    try:
-        if args.load:
-            name, result = "load.json", compare_loads(args.seconds)
-        elif args.update:
-            name, result = "update.json", compare_updates(UPDATES)
-        elif args.cluster is not None:
-            name, result = "cluster.json", compare_places(args.robots, args.workers, args.seconds)
-        else:
-            name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
-        write_json(args.out / name, result)
-    except (WorkerError, OSError) as error:
-        print(f"tdgc.bench: {what_stopped(error)}", file=sys.stderr)
-        return 1
+    check_flags(args)
+    args.workers = choose_workers(args)
+    make_folder(args.out)
+    if args.load:
+        name, result = "load.json", compare_loads(args.seconds)
+    elif args.update:
+        name, result = "update.json", compare_updates(UPDATES)
+    elif args.cluster is not None:
+        name, result = "cluster.json", compare_places(args.robots, args.workers, args.seconds)
+    else:
+        name, result = "bench.json", compare_grounds(args.robots, args.workers, args.seconds)
+    write_json(args.out / name, result)
     return 0
 
 

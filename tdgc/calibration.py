@@ -26,11 +26,10 @@ from torch import nn
 from tdgc import policies
 from tdgc.benchmark.tracking import draw_commands, walk_on_plane
 from tdgc.config import CalibrationConfig, CommandRanges, ConfigError
-from tdgc.errors import interruptible, what_stopped
+from tdgc.errors import script
 from tdgc.files import make_folder
 from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.parallel.jobs import run_jobs
-from tdgc.parallel.worker import WorkerError
 from tdgc.policies import Correction, Policy
 from tdgc.policies.files import files_of
 from tdgc.sim.commands import NAMES, NUM_COMMANDS, SIDEWAYS, command_bounds
@@ -250,7 +249,7 @@ def calibrate(
     }  # fmt: skip
 
 
-@interruptible("tdgc.calibration")
+@script("tdgc.calibration")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.calibration", description=(__doc__ or "").partition("\n")[0]
@@ -269,31 +268,23 @@ def main(arguments: list[str] | None = None) -> int:
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=42, help="random seed (42)")
     args = parser.parse_args(arguments)
-    try:
-        for name, least in (("robots", LEAST_ROBOTS), ("seed", 0)):
-            if getattr(args, name) < least:
-                raise ValueError(f"--{name} must be {least} or more, not {getattr(args, name)}")
-        if args.workers != "auto" and args.workers < 1:
-            raise ValueError(f"--workers must be 1 or more, not {args.workers}")
-        low = load_low(args.low)[0]
-        if low.meta.get("calibration", {}).get("robots"):
-            raise ValueError(
-                f"{args.low} is calibrated already; give the policy from before, which "
-                "train_low.py keeps as 'uncalibrated' in its run folder"
-            )
-        if files_of(args.out)[0].absolute() == files_of(args.low)[0].absolute():
-            raise ValueError(f"--out would replace --low, {args.low}; give another path")
-        make_folder(args.out.parent)
-    except (ValueError, OSError) as error:
-        print(f"tdgc.calibration: {error}", file=sys.stderr)
-        return 2
+    for name, least in (("robots", LEAST_ROBOTS), ("seed", 0)):
+        if getattr(args, name) < least:
+            raise ValueError(f"--{name} must be {least} or more, not {getattr(args, name)}")
+    if args.workers != "auto" and args.workers < 1:
+        raise ValueError(f"--workers must be 1 or more, not {args.workers}")
+    low = load_low(args.low)[0]
+    if low.meta.get("calibration", {}).get("robots"):
+        raise ValueError(
+            f"{args.low} is calibrated already; give the policy from before, which "
+            "train_low.py keeps as 'uncalibrated' in its run folder"
+        )
+    if files_of(args.out)[0].absolute() == files_of(args.low)[0].absolute():
+        raise ValueError(f"--out would replace --low, {args.low}; give another path")
+    make_folder(args.out.parent)
     workers = usable_cores() if args.workers == "auto" else args.workers
-    try:
-        correction, facts = calibrate(low, CalibrationConfig(args.robots), workers, args.seed)
-        policies.save_copy(args.out, low, {**low.meta, "calibration": facts}, correction)
-    except (ValueError, WorkerError, OSError) as error:
-        print(f"tdgc.calibration: {what_stopped(error)}", file=sys.stderr)
-        return 2 if isinstance(error, ValueError) else 1
+    correction, facts = calibrate(low, CalibrationConfig(args.robots), workers, args.seed)
+    policies.save_copy(args.out, low, {**low.meta, "calibration": facts}, correction)
     print(
         f"{facts['walked']:.0f} of {args.robots} robots walked; the fit predicts what commands "
         f"lead to within {facts['error_vx_m_s']:.3f} and {facts['error_vy_m_s']:.3f} m/s and "

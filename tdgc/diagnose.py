@@ -14,11 +14,12 @@ from pathlib import Path
 from tdgc.benchmark import diagnosis, trace
 from tdgc.deploy import log
 from tdgc.deploy.controller import Controller
-from tdgc.errors import interruptible, require
+from tdgc.errors import require, script
+from tdgc.files import make_folder
 from tdgc.sim.geometry import read_geometry
 
 
-@interruptible("tdgc.diagnose")
+@script("tdgc.diagnose")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.diagnose", description=(__doc__ or "").partition("\n")[0]
@@ -34,24 +35,20 @@ def main(arguments: list[str] | None = None) -> int:
         "--out", type=Path, default=Path("runs/diagnosis"), help="results folder (runs/diagnosis)"
     )
     args = parser.parse_args(arguments)
-    try:
-        require("a log's diagnosis", ("jsonschema", "onnxruntime"), "mujoco")
-        require("a trace", ("pyarrow",), "trace")
-        controller = Controller(args.export)
-        geometry = read_geometry(controller.robot())
-        found = log.read(args.log, controller)
-        episode = log.trace(found, controller, args.outcome)
-        compared = log.replay(found, controller)
-        args.out.mkdir(parents=True, exist_ok=True)
-        (args.out / "diagnosis.csv").unlink(missing_ok=True)  # of an earlier run
-        path = trace.write(episode, args.out)
-        failure = None
-        if episode.outcome != "reached":
-            failure = diagnosis.diagnose(episode, float(geometry.hips[0, 0]))
-            diagnosis.write([failure], args.out / "diagnosis.csv")
-    except (ValueError, OSError) as error:
-        print(f"tdgc.diagnose: {error}", file=sys.stderr)
-        return 2
+    require("a log's diagnosis", ("jsonschema", "onnxruntime"), "mujoco")
+    require("a trace", ("pyarrow",), "trace")
+    controller = Controller(args.export)
+    geometry = read_geometry(controller.robot())
+    found = log.read(args.log, controller)
+    episode = log.trace(found, controller, args.outcome)
+    compared = log.replay(found, controller)
+    make_folder(args.out)
+    (args.out / "diagnosis.csv").unlink(missing_ok=True)  # of an earlier run
+    path = trace.write(episode, args.out)
+    failure = None
+    if episode.outcome != "reached":
+        failure = diagnosis.diagnose(episode, float(geometry.hips[0, 0]))
+        diagnosis.write([failure], args.out / "diagnosis.csv")
     print(f"{found.name}: {episode.outcome} after {episode['time'][-1]:.2f} s; trace in {path}")
     if failure is not None:
         print(f"{failure.layer}: {failure.cause}\n{failure.evidence}")

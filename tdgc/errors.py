@@ -1,5 +1,4 @@
-"""Errors about unusable input, interruptions, one-line descriptions of both, and a check for
-optional packages."""
+"""What stops a program: unusable input, failures, interruptions, missing packages; in one line."""
 
 import functools
 import importlib.util
@@ -17,6 +16,15 @@ class InputError(ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
+
+
+class WorkerError(RuntimeError):
+    """A worker died, hung or raised; the message includes its traceback if there is one."""
+
+
+#: What may stop a program besides unusable input and Ctrl-C: a robot that blows up, a full disk or
+#: memory, a dead process.
+FAILURES = (FloatingPointError, OSError, MemoryError, WorkerError)
 
 
 class StoppedError(Exception):
@@ -40,18 +48,23 @@ def what_stopped(error: BaseException) -> str:
 P = ParamSpec("P")
 
 
-def interruptible(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
-    """Decorate a script's ``main``, so that Ctrl-C ends it with one line, which begins with
-    ``name``, and exit status 1."""
+def script(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
+    """Decorate a script's ``main``: whatever stops it becomes one line that begins with ``name``.
+
+    The exit status is 2 for input that cannot be used, a ``ValueError``, and 1 for ``FAILURES`` and
+    Ctrl-C.
+    """
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
         @functools.wraps(main)
         def run(*args: P.args, **keywords: P.kwargs) -> int:
             try:
                 return main(*args, **keywords)
-            except KeyboardInterrupt as error:
+            except (ValueError, *FAILURES, KeyboardInterrupt) as error:
                 print(f"{name}: {what_stopped(error)}", file=sys.stderr)
-                sys.exit(1)  # instead of returning, so that a caller stops, too
+                if isinstance(error, KeyboardInterrupt):
+                    sys.exit(1)  # instead of returning, so that a caller stops, too
+                return 2 if isinstance(error, ValueError) else 1
 
         return run
 

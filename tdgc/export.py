@@ -38,8 +38,8 @@ from tdgc.config import (
 from tdgc.deploy.controller import FORMATS, Controller, quiet
 from tdgc.deploy.graphs import HighGraph, LowGraph, Signal
 from tdgc.deploy.interface import VERSION, Table, interface_path
-from tdgc.errors import interruptible, require
-from tdgc.files import checksum, write_text
+from tdgc.errors import require, script
+from tdgc.files import checksum, make_folder, write_text
 from tdgc.policies import Policy
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import (
@@ -522,7 +522,7 @@ def _choose_formats(text: str) -> list[str]:
     return names
 
 
-@interruptible("tdgc.export")
+@script("tdgc.export")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.export", description=(__doc__ or "").partition("\n")[0]
@@ -536,16 +536,12 @@ def main(arguments: list[str] | None = None) -> int:
         "--format", default=",".join(FORMATS), help=f"comma-separated ({','.join(FORMATS)})"
     )
     args = parser.parse_args(arguments)
-    try:
-        formats = _choose_formats(args.format)
-        pair = load_pair(args.low, args.high)
-        args.out.mkdir(parents=True, exist_ok=True)
-        write(pair, args.out, formats)
-        th.set_num_threads(1)  # times are reported for one core
-        good = [_report(form, check(args.out, form, args.low, args.high)) for form in formats]
-    except (ValueError, OSError) as error:
-        print(f"tdgc.export: {error}", file=sys.stderr)
-        return 2
+    formats = _choose_formats(args.format)
+    pair = load_pair(args.low, args.high)
+    make_folder(args.out)
+    write(pair, args.out, formats)
+    th.set_num_threads(1)  # times are reported for one core
+    good = [_report(form, check(args.out, form, args.low, args.high)) for form in formats]
     return 0 if all(good) else 1
 
 

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from tdgc.errors import InputError
+
 
 @contextlib.contextmanager
 def atomic(path: Path) -> Iterator[Path]:
@@ -65,10 +67,13 @@ def make_folder(folder: Path) -> None:
     """Make a folder and check that it is writable, so that a failure comes before the work.
 
     Raises:
-        OSError: the folder cannot be made or written to.
+        InputError: the folder cannot be made or written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    tempfile.TemporaryFile(dir=folder).close()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InputError(f"'{folder}' cannot be used: {error.strerror}") from error
 
 
 def checksum(path: Path) -> str:

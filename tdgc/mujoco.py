@@ -21,11 +21,11 @@ from tdgc.benchmark import flags
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Batch, Cell, Episode, Watcher, closed_loop, plan
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import FAILURES, describe, make_room, salvage, write_results
+from tdgc.benchmark.results import describe, make_room, salvage, write_results
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
-from tdgc.errors import interruptible, require, what_stopped
+from tdgc.errors import require, script
 from tdgc.files import write_json
 from tdgc.parallel.jobs import run_jobs
 from tdgc.show import film
@@ -163,7 +163,7 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     """Run all cells and write all results; return problems with the films, one line each.
 
     Raises:
-        Exception: one of ``FAILURES`` occurred; the table of the complete cells is still written.
+        Exception: one of ``FAILURES``; the table of the complete cells is still written.
     """
     settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
     write_json(args.out / "settings.json", settings)
@@ -267,33 +267,18 @@ def check(args: argparse.Namespace) -> "MujocoConfig":
     return config
 
 
-@interruptible("tdgc.mujoco")
+@script("tdgc.mujoco")
 def main(arguments: list[str] | None = None) -> int:
-    def fail(error: object) -> None:
-        print(f"tdgc.mujoco: {error}", file=sys.stderr)
-
     args = parse(arguments)
-    try:
-        config = check(args)
-        if not args.gui:
-            folders = {"logs": args.log > 0, "films": args.video > 0}
-            make_room(args.out, ["logs/*.npz", "settings.json"], folders)
-    except (ValueError, OSError) as error:
-        fail(error)
-        return 2
-    problems: list[str] = []
-    try:
-        if args.gui:
-            show(args, config)
-        else:
-            problems = run_table(args, config)
-    except (ValueError, WindowError) as error:  # no robot, terrain or window where it is needed
-        fail(what_stopped(error))
-        return 2
-    except FAILURES as error:
-        problems = [what_stopped(error)]
+    config = check(args)
+    if args.gui:
+        show(args, config)
+        return 0
+    folders = {"logs": args.log > 0, "films": args.video > 0}
+    make_room(args.out, ["logs/*.npz", "settings.json"], folders)
+    problems = run_table(args, config)
     for problem in problems:
-        fail(problem)
+        print(f"tdgc.mujoco: {problem}", file=sys.stderr)
     return 1 if problems else 0
 
 

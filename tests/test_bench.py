@@ -116,7 +116,7 @@ def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
         ("--seconds 0", "--seconds must be above 0, not 0\n"),
         ("--seconds=-1", "--seconds must be above 0, not -1\n"),
         ("--seconds nan", "--seconds must be above 0, not nan\n"),
-        ("--out {0}/file/out", "[Errno 20] Not a directory: '{0}/file/out'\n"),
+        ("--out {0}/file/out", "'{0}/file/out' cannot be used: Not a directory\n"),
     ],
 )
 def test_what_cannot_be_used_is_one_line_before_anything_is_measured(

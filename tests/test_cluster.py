@@ -25,11 +25,11 @@ import tdgc
 import train_high
 import train_low
 from tdgc import bench
+from tdgc.errors import WorkerError
 from tdgc.learn.run import Interruption
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import ActorLink, ClusterError, connect
 from tdgc.parallel.vec import TaskVecEnv, worker_seed
-from tdgc.parallel.worker import WorkerError
 
 TESTS = Path(__file__).resolve().parent
 

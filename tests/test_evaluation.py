@@ -48,9 +48,8 @@ from tdgc.config import (
     TeacherConfig,
     to_dict,
 )
-from tdgc.errors import InputError
+from tdgc.errors import InputError, WorkerError
 from tdgc.parallel import cluster
-from tdgc.parallel.worker import WorkerError
 from tdgc.show import gui
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import default_command

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from stubs import DIE, FAR, HANG, INFINITE, NAN_EARNED, NAN_SEEN, RAISE, Fragile
 
 from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
+from tdgc.errors import WorkerError
 from tdgc.parallel.vec import FAULT_STEPS, Fault, TaskVecEnv, worker_seed
-from tdgc.parallel.worker import WorkerError
 from tdgc.sim.observation import columns
 from tdgc.state import join, split
 from tdgc.tasks.low_env import LowLevelTask

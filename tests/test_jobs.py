@@ -5,8 +5,8 @@ import time
 
 import pytest
 
+from tdgc.errors import WorkerError
 from tdgc.parallel.jobs import run_jobs
-from tdgc.parallel.worker import WorkerError
 
 
 def reciprocal(number: float) -> float:

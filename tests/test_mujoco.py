@@ -24,7 +24,7 @@ from tdgc.config import ConfigError, RobotConfig
 from tdgc.deploy import log
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogError, LogWriter
-from tdgc.parallel.worker import WorkerError
+from tdgc.errors import WorkerError
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import Array, nominal_height, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import TileField

@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parents[1]
 #: From the ground up, each floor's rooms: folders, and modules outside any folder. A module imports
 #: only from lower floors and from its own room, so rooms on the same floor are independent.
 FLOORS = (
-    ("tdgc", "errors", "files", "state"),
-    ("config",),
+    ("tdgc", "errors", "state"),
+    ("config", "files"),
     ("policies", "sim", "parallel"),
     ("tasks",),
     ("learn", "benchmark"),

@@ -868,8 +868,8 @@ def test_flags_and_folders_that_cannot_be_used(
     assert not empty.exists()
     for train in (train_low, train_high):  # before the teacher is tried out
         assert train.main(["--out", str(used / "log.jsonl")]) == 2
-        message = f"--out '{used / 'log.jsonl'}' cannot be used: File exists"
-        assert message in capsys.readouterr().err
+        message = f"{train.__name__}.py: '{used / 'log.jsonl'}' cannot be used: File exists\n"
+        assert capsys.readouterr().err.endswith(message)
 
 
 def test_a_run_killed_before_its_first_checkpoint_leaves_its_folder_free(

@@ -17,9 +17,10 @@ import pytest
 from stubs import Counter, make_counter, make_failing
 
 from tdgc.config import LowLevelConfig, PhysicsConfig
+from tdgc.errors import WorkerError
 from tdgc.parallel import worker
 from tdgc.parallel.vec import TaskVecEnv, worker_seed
-from tdgc.parallel.worker import ProcessLink, WorkerError
+from tdgc.parallel.worker import ProcessLink
 from tdgc.state import split
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import low_spaces

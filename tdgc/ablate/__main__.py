@@ -25,8 +25,8 @@ from tdgc.ablate.table import Found, describe, rows
 from tdgc.ablate.trials import Runner, Tile, Trial, TrialError, uncalibrated
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
-from tdgc.errors import InputError, StoppedError, interruptible
-from tdgc.files import write_json, write_text
+from tdgc.errors import InputError, StoppedError, script
+from tdgc.files import make_folder, write_json, write_text
 from tdgc.learn.run import sole_user
 from tdgc.parallel.cores import workers_flag
 from tdgc.show import plots
@@ -154,7 +154,7 @@ def claim(runner: Runner, tiles: Sequence[Tile]) -> dict[str, Any]:
     }
     path = runner.out / "settings.json"
     if not path.is_file():
-        runner.out.mkdir(parents=True, exist_ok=True)
+        make_folder(runner.out)
         write_json(path, common)
         return common
     before = read_json(path)
@@ -231,7 +231,7 @@ def conduct(
     return found, True
 
 
-@interruptible("tdgc.ablate")
+@script("tdgc.ablate")
 def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     deadline = None if args.time_limit is None else time.monotonic() + args.time_limit
@@ -239,29 +239,17 @@ def main(arguments: list[str] | None = None) -> int:
         args.out, args.low, args.no_teacher, tuple(args.assignments), args.steps, args.levels,
         args.episodes, args.workers, deadline,
     )  # fmt: skip
-    try:
-        if args.time_limit is not None and not args.time_limit >= 0.0:
-            raise InputError(f"--time-limit must be at least 0 s, not {args.time_limit:g}")
-        chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
-        check_trainings(runner, chosen, seeds)
-        if args.only is None:
-            chosen = without_missing(chosen, args.low)
-        tiles = runner.tiles()
-        common = claim(runner, tiles)
-    except (ValueError, OSError) as error:
-        print(f"tdgc.ablate: {error}", file=sys.stderr)
-        return 2
-    trials = plan(chosen, seeds)
-    try:
-        with sole_user(args.out):
-            found, finished = conduct(runner, trials, common, tiles)
-            print(report(args.out, common, tiles, trials, found))
-    except InputError as error:  # another ablation runs in the folder
-        print(f"tdgc.ablate: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:  # finished trials stay in their folders
-        print(f"tdgc.ablate: {error}", file=sys.stderr)
-        return 1
+    if args.time_limit is not None and not args.time_limit >= 0.0:
+        raise InputError(f"--time-limit must be at least 0 s, not {args.time_limit:g}")
+    chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
+    check_trainings(runner, chosen, seeds)
+    if args.only is None:
+        chosen = without_missing(chosen, args.low)
+    tiles, trials = runner.tiles(), plan(chosen, seeds)
+    common = claim(runner, tiles)
+    with sole_user(args.out):
+        found, finished = conduct(runner, trials, common, tiles)
+        print(report(args.out, common, tiles, trials, found))
     if not finished:
         print("stopped; run the same command to continue")
     asked = {trial.name: found.get(trial) for trial in trials}

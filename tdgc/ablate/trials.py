@@ -4,17 +4,15 @@ A trial's folder holds the files of its training run, ``evaluation`` with the re
 evaluate.py, and ``cell.json`` once it is done. Until then, running it again continues where it was.
 """
 
-import contextlib
 import csv
-import io
+import inspect
 import itertools
 import shutil
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +22,7 @@ import train_high
 from tdgc import policies
 from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
-from tdgc.errors import InputError, StoppedError
+from tdgc.errors import FAILURES, InputError, StoppedError, what_stopped
 from tdgc.files import write_json
 from tdgc.learn.run import signals_restored
 from tdgc.parallel.cores import Workers
@@ -114,8 +112,8 @@ class Runner:
             )
         except StoppedError:
             raise
-        except (InputError, OSError) as error:  # their messages name the file
-            raise TrialError(str(error)) from error
+        except (ValueError, *FAILURES) as error:
+            raise TrialError(what_stopped(error)) from error
         except Exception as error:  # whatever happened, the other trials continue
             said = " ".join(str(error).split())
             raise TrialError(f"{type(error).__name__}: {said}") from error
@@ -210,35 +208,15 @@ class Runner:
 # ---------------------------------------------------------------------------- the two scripts
 
 
-class _Tee(io.StringIO):
-    """Passes text on to a stream and keeps a copy."""
-
-    def __init__(self, stream: TextIO) -> None:
-        super().__init__()
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        self._stream.write(text)
-        return super().write(text)
-
-    def flush(self) -> None:
-        self._stream.flush()
-
-
 def call(main: Callable[[list[str]], int], flags: Sequence[object]) -> None:
-    """Call a script's ``main``.
+    """Call a script's ``main``; what stops it is raised instead of printed.
 
     Raises:
-        TrialError: it failed; the message is the script's last error line, or else its status.
+        TrialError: it ended with an exit status, after printing why.
     """
-    said = _Tee(sys.stderr)
-    with contextlib.redirect_stderr(said):
-        status = main([str(flag) for flag in flags])
+    status = inspect.unwrap(main)([str(flag) for flag in flags])
     if status:
-        script = f"{main.__module__}.py: "
-        lines = said.getvalue().replace("\r", "\n").splitlines()
-        named = [line.removeprefix(script) for line in lines if line.startswith(script)]
-        raise TrialError(named[-1] if named else f"{script}status {status}")
+        raise TrialError(f"{main.__module__}.py: status {status}")
 
 
 # ---------------------------------------------------------------------------- policies

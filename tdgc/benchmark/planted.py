@@ -32,10 +32,9 @@ from tdgc.benchmark.diagnosis import (
 )
 from tdgc.benchmark.drivers import BaselineDriver, Decides, Driver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Cell, run_cell
-from tdgc.benchmark.results import FAILURES
 from tdgc.benchmark.trace import Trace, Tracer
 from tdgc.config import HighLevelConfig, LowLevelConfig
-from tdgc.errors import interruptible, what_stopped
+from tdgc.errors import script
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, VELOCITIES
 from tdgc.sim.geometry import read_geometry
@@ -183,7 +182,7 @@ def measured_limits(traces: Sequence[Trace], hips: float) -> Mapping[str, tuple[
     return {name: (highest(name, False), highest(name, True)) for name in LIMITS}
 
 
-@interruptible("tdgc.benchmark.planted")
+@script("tdgc.benchmark.planted")
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.benchmark.planted",
@@ -193,18 +192,9 @@ def main(arguments: list[str] | None = None) -> int:
     for name, path in shipped.items():
         parser.add_argument(f"--{name}", type=Path, default=path, help=f"{name} policy (shipped)")
     args = parser.parse_args(arguments)
-    try:
-        low, low_config = load_low(args.low)
-        pair = load_high(args.high, low, low_config)
-        hips = float(read_geometry(low_config.robot).hips[0, 0])
-    except (ValueError, OSError) as error:
-        print(f"tdgc.benchmark.planted: {error}", file=sys.stderr)
-        return 2
-    try:
-        count_blames(low, low_config, pair, hips)
-    except FAILURES as error:
-        print(f"tdgc.benchmark.planted: {what_stopped(error)}", file=sys.stderr)
-        return 1
+    low, low_config = load_low(args.low)
+    pair = load_high(args.high, low, low_config)
+    count_blames(low, low_config, pair, float(read_geometry(low_config.robot).hips[0, 0]))
     return 0
 
 

@@ -14,15 +14,11 @@ from tqdm import tqdm
 from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
 from tdgc.files import atomic, make_folder, write_json
-from tdgc.parallel.worker import WorkerError
 from tdgc.sim.terrain import EDITION
 
 #: Files written by ``write_results``.
 FILES = ("episodes.csv", "summary.json", "trajectories.npz")
 _FILMS = ("films/film_*", "films/sheet_*", "films/strip_*")
-#: What may stop an evaluation besides Ctrl-C: a robot that blows up, a full disk or memory, a dead
-#: process.
-FAILURES = (FloatingPointError, OSError, MemoryError, WorkerError)
 #: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and
 #: the benchmark editions of the tiles and of the policies' training.
 PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"

@@ -115,22 +115,22 @@ class Checkpoint:
 
     @classmethod
     def newest(cls, run: Path, warn: Callable[[str], None]) -> "Checkpoint":
-        """Read the newest readable checkpoint of a run; warn if it is not the newest.
+        """Read the newest readable checkpoint of a run; warn of newer ones that are not readable.
 
         Raises:
             CheckpointError: the run has no readable checkpoint.
         """
-        problem: CheckpointError | None = None
+        problems: list[CheckpointError] = []
         for path in sorted((run / "checkpoints").glob("step-*"), reverse=True):
             try:
                 found = cls.read(path)
             except CheckpointError as error:
-                problem = problem or error
+                problems.append(error)
             else:
-                if problem is not None:
+                for problem in problems:
                     warn(f"{problem}; going on from {path.name}")
                 return found
-        raise problem or CheckpointError(f"{run}: no checkpoint")
+        raise problems[0] if problems else CheckpointError(f"{run}: no checkpoint")
 
     def save(self, folder: Path) -> Path:
         """Write the checkpoint to ``folder`` atomically and delete all but the newest two.

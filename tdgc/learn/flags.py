@@ -17,7 +17,6 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
-from tdgc.files import make_folder
 from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connect
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.worker import MakeLink, ProcessLink
@@ -168,18 +167,6 @@ def _fits(kind: type[LowTrainConfig] | type[HighTrainConfig], table: Any) -> boo
     except ConfigError:
         return False
     return True
-
-
-def make_run_folder(out: Path) -> None:
-    """Make the run folder ``out``, so that one that cannot be used fails before any simulation.
-
-    Raises:
-        ConfigError: it cannot be made or written to.
-    """
-    try:
-        make_folder(out)
-    except OSError as error:
-        raise ConfigError(f"--out '{out}' cannot be used: {error.strerror}") from error
 
 
 def _has_begun(run: Path) -> bool:

@@ -39,11 +39,11 @@ from tdgc.config import (
     recorded,
     to_dict,
 )
-from tdgc.errors import InputError
+from tdgc.errors import InputError, WorkerError
 from tdgc.files import write_json, write_text
 from tdgc.learn.checkpoints import Checkpoint
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
-from tdgc.parallel.worker import WorkerError, memory_mb
+from tdgc.parallel.worker import memory_mb
 
 
 @dataclass(frozen=True)

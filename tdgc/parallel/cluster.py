@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.errors import InputError, require
+from tdgc.errors import InputError, WorkerError, require
 from tdgc.parallel.jobs import Job, Result
-from tdgc.parallel.worker import BLAS_THREADS, Arrays, Beginning, Worker, WorkerError, keep_memory
+from tdgc.parallel.worker import BLAS_THREADS, Arrays, Beginning, Worker, keep_memory
 from tdgc.state import copies
 
 _REACH_SECONDS = 5.0  # limit for connecting to the cluster's address

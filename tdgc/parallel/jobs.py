@@ -6,8 +6,8 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Protocol, TypeVar
 
+from tdgc.errors import WorkerError
 from tdgc.parallel.worker import (
-    WorkerError,
     end_with_parent,
     keep_memory,
     one_blas_thread,

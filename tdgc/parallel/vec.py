@@ -11,16 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from tdgc.errors import in_one_line
-from tdgc.parallel.worker import (
-    Arrays,
-    Beginning,
-    Link,
-    MakeLink,
-    MakeTask,
-    ProcessLink,
-    WorkerError,
-)
+from tdgc.errors import WorkerError, in_one_line
+from tdgc.parallel.worker import Arrays, Beginning, Link, MakeLink, MakeTask, ProcessLink
 from tdgc.state import State, copies
 
 #: A run stops at this many worker faults within this many steps. A fault in the code recurs at

@@ -29,6 +29,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tdgc.errors import WorkerError
 from tdgc.state import State
 
 #: Observations are scaled to order one; a robot with larger ones has blown up. For the low policy
@@ -74,10 +75,6 @@ class MakeTask(Protocol):
     """Makes a worker's task; ``first`` is the number of its first robot among those of the run."""
 
     def __call__(self, robots: int, seed: int, *, first: int) -> Task: ...
-
-
-class WorkerError(RuntimeError):
-    """A worker died, hung or raised; the message includes its traceback if there is one."""
 
 
 class Link(Protocol):

@@ -4,8 +4,10 @@ import ctypes
 import os
 import sys
 
+from tdgc.errors import InputError
 
-class WindowError(RuntimeError):
+
+class WindowError(InputError):
     """A simulator's window cannot be opened or was closed; the message is one line."""
 
 
