@@ -25,7 +25,7 @@ from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, Teac
 from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, plan, run_cell
 from tdgc.benchmark.flags import add_arguments, choose, resolve
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import describe, make_room, salvage, write_results
+from tdgc.benchmark.results import EDITIONS, describe, make_room, salvage, write_results
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
@@ -417,7 +417,7 @@ def run_tracking(evaluation: Evaluation, low: Policy) -> None:
     """Measure the low policy alone, print the results and write tracking.json."""
     e = evaluation
     result = tracking(low, e.episodes, e.seed, e.workers, e.run_jobs)
-    write_json(e.out / "tracking.json", result)
+    write_json(e.out / "tracking.json", result | {EDITIONS: editions(low, {})})
     print("gait    velocity RMSE  yaw rate RMSE  contact match")
     for gait, r in result["gaits"].items():
         print(

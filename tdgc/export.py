@@ -59,6 +59,7 @@ from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
 from tdgc.sim.terrain import TileField, make_tile
 from tdgc.sim.urdf import JOINTS, mesh_path, read_urdf
+from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_observation import SEMANTIC
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
@@ -424,7 +425,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     pair, controller = load_pair(low, high), Controller(folder, form)
     driver = HierarchyDriver(pair.high, pair.high_config)
     loco, start, goal = _stage(pair, controller)
-    world = loco.world
+    world, executor = loco.world, Executor(loco, pair.low)
     differences: list[Array] = []
     seconds: list[float] = []
     log: list[tuple[bool, dict[str, Array]]] = []
@@ -442,7 +443,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
             seconds.append(controller.seconds)
             log.append((ended, readings))
             driver.command(controller.count - 1)
-            differences += _act(pair, controller, driver, loco)
+            differences += _act(pair, controller, driver, executor)
             ended = bool(outcome(world, goal)[0] != GOING)
     finally:
         world.close()
@@ -465,20 +466,19 @@ def _stage(pair: Pair, controller: Controller) -> tuple[Locomotion, Array, Array
     config, field = pair.low_config, TileField.of(tile)
     physics = dataclasses.replace(config.physics, control_dt=controller.dt)
     loco = Locomotion(BulletWorld(1, controller.robot(), physics, field), config)
-    loco.correct = pair.low.correct
     return loco, field.starts, field.goals
 
 
 def _act(
-    pair: Pair, controller: Controller, driver: HierarchyDriver, loco: Locomotion
+    pair: Pair, controller: Controller, driver: HierarchyDriver, executor: Executor
 ) -> list[Array]:
     """Carry out a step that controller and driver have decided on; how far policies and graphs
     differ in it."""
-    limit, world = pair.low_config.robot.action_limit, loco.world
+    loco, limit = executor.loco, pair.low_config.robot.action_limit
+    world = loco.world
     decoder = CommandDecoder(driver.bounds, pair.high_config.action_limit, pair.high_config.gaits)
     decision, low = controller.high.values["decision"], controller.low.values
-    loco.command[:] = controller.commands
-    wanted = np.clip(pair.low.predict(loco.observe())[0], -limit, limit)
+    wanted = np.clip(executor.decide(controller.commands[None]), -limit, limit)
     error, speed = low["joint_targets"] - world.state.q, world.state.qd
     told, torque = (
         pd_torque(error, speed, world.strength, robot)

@@ -177,14 +177,19 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
         logs=args.out / "logs",
         logged=args.log,
     )
+    controller = load(args.export)
+    trained_on = {
+        name: graph.table["policy"].get("benchmark", 1)
+        for name, graph in (("low", controller.low), ("high", controller.high))
+    }
     episodes: list[Episode] = []
     recordings: list[Recording] = []
-    with salvage(args.out, episodes, cells) as bar:
+    with salvage(args.out, episodes, cells, trained_on) as bar:
         for ran, recorded in run_jobs(work, cells, args.workers):
             episodes += ran
             recordings += recorded
             bar.update(len(ran))
-    print(describe(write_results(args.out, episodes)))
+    print(describe(write_results(args.out, episodes, trained_on)))
     print(f"\ntables are in {args.out}")
     return film.produce(recordings, args.out / "films", args.workers) if recordings else []
 

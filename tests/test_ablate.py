@@ -7,17 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 
 import train_high
 from tdgc import policies
 from tdgc.ablate import trials
 from tdgc.ablate.__main__ import choose, main, plan, without_missing
 from tdgc.ablate.table import Found, describe, rows
-from tdgc.ablate.trials import Result, Runner, Trial
+from tdgc.ablate.trials import Result, Runner, Trial, changed_pair
 from tdgc.ablate.variants import HELPS, VARIANTS, WHOLE, Variant, variants
 from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, LowLevelConfig, with_overrides
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.learn.run import Interruption, sole_user
+from tdgc.policies.correction import Correction
 from tdgc.sim.commands import NUM_ACTIONS
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import high_mirror
@@ -95,13 +97,14 @@ def test_rows_are_over_tiles_and_seeds_and_pairs_have_the_same_seed() -> None:
     assert [trial.name for trial in trials] == [
         "full-1", "trot-1", "semantic-1", "gp", "full-2", "trot-2", "semantic-2"
     ]  # fmt: skip
-    facts = {"steps": 1000, "train_seconds": 1800, "simulated_hours": 0.5}
+    evaluated = {"evaluate_seconds": 90.0}
+    facts = evaluated | {"steps": 1000, "train_seconds": 1800, "simulated_hours": 0.5}
     found: dict[Trial, Found] = {
         Trial(full, 1): result("11111100", **facts),
         Trial(full, 2): result("11111111", **facts | {"train_seconds": 5400}),
         Trial(trot, 1): result("11110000", **facts),
         Trial(trot, 2): "3 faults of workers",
-        Trial(gp, None): result("00001111"),
+        Trial(gp, None): result("00001111", **evaluated),
     }
     table = rows(TILES, trials, found)
     whole, one, later, script = table
@@ -119,9 +122,10 @@ def test_rows_are_over_tiles_and_seeds_and_pairs_have_the_same_seed() -> None:
     text = describe(table)
     lines = [line.split() for line in text.splitlines()]
     assert lines[0][:2] == ["variant", "n"]
-    assert lines[0][-4:] == ["rough", "gap", "steps", "hours"]
+    assert lines[0][-6:] == ["rough", "gap", "steps", "walked", "trained", "evaluated"]
     assert lines[1][:3] == ["full", "16", "87.5%"]
-    assert lines[1][-4:] == ["100.0%", "75.0%", "0.00M", "1.00"]
+    assert lines[1][-9:] == ["100.0%", "75.0%", "0.00M", "0.5", "h", "1.00", "h", "1.5", "min"]
+    assert lines[4][-4:] == ["0.0%", "100.0%", "1.5", "min"]
     assert lines[2][:6] == ["trot", "8", "50.0%", "[21.5,", "78.5]", "-25.0"]
     assert lines[3] == ["semantic", "to", "come"]
     assert text.splitlines()[-1] == "trot, seed 2: 3 faults of workers"
@@ -165,15 +169,13 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
         None, None, None
     ]  # fmt: skip
     assert main(command) == 1
-    missing = LOW.with_name("uncalibrated.json")
-    assert capsys.readouterr().err.splitlines()[-1] == (
-        f"tdgc.ablate: uncalibrated-5: {missing}: no such file"
-    )
+    missing = f"'{LOW}' has no correction to leave out"
+    assert capsys.readouterr().err.splitlines()[-1] == f"tdgc.ablate: uncalibrated-5: {missing}"
     result = json.loads((out / "ablation.json").read_text())
     full, pose, uncalibrated = result["rows"]
     assert (full["n"], full["steps"], full["simulated_hours"]) == (1, 48, 0.0)
     assert (pose["n"], pose["versus"]["n"]) == (1, 1) and "steps" not in pose
-    assert uncalibrated["errors"] == {"5": f"{missing}: no such file"}
+    assert uncalibrated["errors"] == {"5": missing}
     assert result["settings"]["steps"] == 48 and (out / "ablation.png").is_file()
     # The copy has the fixed pose and the tensors of its policy.
     changed, given = policies.load(out / "fixed-pose-5" / "low"), policies.load(LOW)
@@ -223,17 +225,18 @@ def finish(folder: Path) -> None:
     (folder / EPISODES).write_text("family,level,episode,outcome\ntilt,6,0,reached\n")
 
 
+@pytest.mark.parametrize("script", ["teacher", "cues"])
 @pytest.mark.parametrize(("trained", "taught"), [(False, False), (True, True), (True, False)])
-def test_the_teacher_leads_as_it_taught_the_full_hierarchy(
-    trained: bool, taught: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_scripts_lead_as_the_teacher_taught_the_full_hierarchy(
+    script: str, trained: bool, taught: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It reads from the high policy of ``full`` how it commands the low policy, unless that was
+    """They read from the high policy of ``full`` how to command the low policy, unless that was
     trained without a teacher."""
     asked: list[object] = []
 
     def evaluated(main: object, flags: list[object]) -> None:
         asked.extend(flags)
-        shutil.copytree(tmp_path / "of-another" / "evaluation", tmp_path / "teacher" / "evaluation")
+        shutil.copytree(tmp_path / "of-another" / "evaluation", tmp_path / script / "evaluation")
 
     finish(tmp_path / "of-another")
     if trained:
@@ -243,17 +246,35 @@ def test_the_teacher_leads_as_it_taught_the_full_hierarchy(
         policies.save_copy(tmp_path / "full-7" / "policy", low, meta)
     monkeypatch.setattr(trials, "call", evaluated)
     runner = Runner(tmp_path, LOW, False, ('env.families=["tilt"]',), None, "6", 1, 1, None)
-    assert runner.run(Trial(named("teacher"), None)).reached.tolist() == [True]
+    assert runner.run(Trial(named(script), None)).reached.tolist() == [True]
+    assert asked[asked.index("--policies") + 1] == script
     assert ("--high" in asked) == taught
     if taught:
         assert asked[asked.index("--high") + 1] == tmp_path / "full-7" / "policy"
+
+
+def test_the_policy_right_after_imitation_is_that_of_the_full_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+
+    def evaluated(main: object, flags: list[object]) -> None:
+        asked.extend(flags)
+        shutil.copytree(tmp_path / "full-7" / "evaluation", tmp_path / "imitation-7" / "evaluation")
+
+    finish(tmp_path / "full-7")
+    monkeypatch.setattr(trials, "call", evaluated)
+    runner = Runner(tmp_path, LOW, False, ('env.families=["tilt"]',), None, "6", 1, 1, None)
+    assert runner.run(Trial(named("imitation"), 7)).reached.tolist() == [True]
+    assert asked[asked.index("--high") + 1] == tmp_path / "full-7" / "imitation"
+    assert "imitation" not in [variant.name for variant in variants(alone=True)]
 
 
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
         ("cell.json", "{", "{0}: not a JSON file"),
-        ("cell.json", "{}", "{0}: 'steps' must be a number, not None"),
+        ("cell.json", "{}", "{0}: 'evaluate_seconds' must be a number, not None"),
         (EPISODES, None, "[Errno 2] No such file or directory: '{0}'"),
         (EPISODES, "family\ntilt\n", "{0}: damaged, or not of an evaluation"),
         (EPISODES, "family,level,episode\n", "{0}: no outcome of episode 0 on tilt, level 6"),
@@ -315,16 +336,39 @@ def test_a_report_has_all_that_is_done(tmp_path: Path, capsys: pytest.CaptureFix
     assert "holds an ablation with maps {'hills.npy': 7}, not {}" in capsys.readouterr().err
 
 
-def test_without_an_uncalibrated_policy_its_variants_are_left_out(
+def test_without_a_correction_the_uncalibrated_variants_are_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = [variant.name for variant in without_missing(VARIANTS, LOW)]
     assert "uncalibrated" not in names and "gp-uncalibrated" not in names
     assert len(names) == len(VARIANTS) - 2
-    said = capsys.readouterr().out
-    assert said.startswith("uncalibrated and gp-uncalibrated left out: there is no '")
-    (tmp_path / "uncalibrated.json").touch()
-    assert without_missing(VARIANTS, tmp_path / "policy") == list(VARIANTS)
+    assert capsys.readouterr().out == (
+        f"uncalibrated and gp-uncalibrated left out: '{LOW}' has no correction\n"
+    )
+    low = policies.load(LOW)
+    policies.save_copy(tmp_path / "low", low, low.meta, corrected(low))
+    assert without_missing(VARIANTS, tmp_path / "low") == list(VARIANTS)
+
+
+def corrected(low: policies.Policy) -> Correction:
+    """A correction that walks half as fast as told."""
+    tensors = {
+        "zero": th.zeros(15), "unit": th.ones(15), "sign": th.ones(15),
+        "0.weight": -0.5 * th.eye(3, 15), "0.bias": th.zeros(3),
+    }  # fmt: skip
+    return Correction((15, 3), tensors)
+
+
+@pytest.mark.usefixtures("in_process", "inline_workers")
+def test_a_low_policy_without_its_correction(tmp_path: Path) -> None:
+    low = policies.load(LOW)
+    policies.save_copy(tmp_path / "low", low, low.meta, corrected(low))
+    without, high = changed_pair(named("gp-uncalibrated"), tmp_path / "low", None, tmp_path / "gp")
+    assert high is None
+    left, commands = policies.load(without), np.full((1, 15), 0.4)
+    np.testing.assert_array_equal(left.correct(commands), commands)
+    assert policies.load(tmp_path / "low").correct(commands)[0, 0] < 0.4
+    assert left.tensors.keys() == low.tensors.keys()
 
 
 def test_time_that_is_over_stops_before_a_trial(

@@ -233,6 +233,20 @@ def test_the_baseline_is_not_blamed_on_the_low_level_in_gap(low):
     assert {f.cause for f in failures} == {"walked blindly into a trench"}
 
 
+def test_a_trench_of_a_map_is_found(low, tmp_path):
+    heights = np.zeros((161, 161))
+    heights[70:76] = -0.6
+    path = str(tmp_path / "trench.npy")
+    np.save(path, heights)
+    driver = BaselineDriver()
+    tracer = Tracer(driver)
+    run_cell(Cell("gp", "nominal", path, 10, 0, 2), low[0], driver, planted.SEED, [tracer])
+    for trace in tracer.traces():
+        found = diagnose(trace, HIPS)
+        assert (found.layer, found.cause) == ("decisions", "walked blindly into a trench")
+        assert found.feature.endswith("m from trench 1 of 1")
+
+
 def test_the_teacher_is_not_blind(low):
     driver = TeacherDriver(low[1], Skill(Landing()))
     tracer = Tracer(driver)

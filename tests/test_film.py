@@ -21,7 +21,7 @@ from tdgc.benchmark.evaluation import Batch, Cell, run_cell, tile_of
 from tdgc.benchmark.recording import Recorder, Recording, runs_of_equal, spans
 from tdgc.config import CommandRanges, RobotConfig
 from tdgc.show import film, plots
-from tdgc.sim.commands import default_command
+from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import gait_embedding
 from tdgc.sim.robot import Array, nominal_pose
 from tdgc.tasks.pairing import PRETRAINED, load_low
@@ -78,7 +78,7 @@ class Notes:
                 {
                     "position": state.position[1] - [*self._origin, 0.0],
                     "q": state.q[1].copy(),
-                    "command": self._loco.command[1].copy(),
+                    "command": self._loco.carried_out[1].copy(),
                     "contact": state.foot_force[1] > 1.0,
                 }
             )
@@ -96,6 +96,7 @@ def test_a_recording_is_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [first.name, second.name] == ["gp_nominal_rough_09_000", "gp_nominal_rough_09_001"]
     assert second.outcome == watched[1].outcome == "timeout" and second.ending == "timeout, 0.4 s"
     assert len(second.command) == 20
+    assert second.command[0, INDEX["frequency"]] == pytest.approx(3.5)  # as a gait begins
     for key in ("position", "q", "command", "contact"):
         assert np.array_equal(getattr(second, key), [row[key] for row in notes.rows]), key
     assert second.contact.any() and second.desired.any() and not second.contact.all()

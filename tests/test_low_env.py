@@ -630,6 +630,19 @@ def test_leaps_grow_as_fast_as_pronk_does() -> None:
     task.close()
 
 
+def test_robots_leap_wherever_their_tile_has_trenches() -> None:
+    """Whatever its family is called: ditches have trenches too."""
+    task = begin(dataclasses.replace(TILES, families=("rough", "gap", "ditches")), 12)
+    trenches = np.array([len(tile.trenches) > 0 for tile in task.field.features])
+    assert (trenches == (task.column > 0)).all()
+    leaping = np.zeros(12, dtype=bool)
+    for _ in range(10):
+        task.reset(np.arange(12))
+        leaping |= task.episodes.leaping
+    task.close()
+    assert (leaping == trenches).all()
+
+
 def test_most_crossings_of_trenches_leap() -> None:
     task = begin(dataclasses.replace(TILES, families=("gap", "stair")), 40)
     gap, leaping, commands, yaw = task.column == 0, [], [], []

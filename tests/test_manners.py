@@ -69,6 +69,15 @@ def test_walks_are_tried_first_and_leaps_only_where_there_may_be_trenches(
     assert told[-1] == "trial: 48 of 48 robots leap over trenches at 1 m/s"
 
 
+def test_a_policy_that_falls_when_it_leaps_is_not_tried_on_trenches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    low, config = load_low(PRETRAINED / "low")
+    monkeypatch.setattr(manners, "measure_landing", lambda *_: None)
+    monkeypatch.setattr(manners, "NavigationTask", None)  # so none is made
+    assert arrivals(low, paired(HighLevelConfig(), config), TeacherConfig(), "gap") == 0
+
+
 def test_the_shipped_low_policy_arrives_and_one_that_falls_does_not() -> None:
     shipped, config = load_low(PRETRAINED / "low")
     flailing = Policy(shipped.header, {name: 30.0 * t for name, t in shipped.tensors.items()})

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -25,6 +26,7 @@ from tdgc.deploy import log
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogError, LogWriter
 from tdgc.errors import WorkerError
+from tdgc.sim import mujoco_world
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import Array, nominal_height, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import TileField
@@ -550,6 +552,49 @@ def test_what_is_complete_when_it_is_stopped_is_kept(
     assert tables == {"episodes.csv", "summary.json", "trajectories.npz"}
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert list(summary[runner.POLICY]["nominal"]) == ["rough", "mean"]
+    assert summary["editions"] == {"tiles": 2, "low": 2, "high": 2}
+
+
+class StubViewer:
+    """MuJoCo's viewer, which the user closes after ``steps`` steps."""
+
+    def __init__(self, steps: int) -> None:
+        self.cam, self.left, self.shown = SimpleNamespace(), steps, 0
+
+    def __enter__(self) -> "StubViewer":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def is_running(self) -> bool:
+        self.left -= 1
+        return self.left >= 0
+
+    def sync(self) -> None:
+        self.shown += 1
+
+
+def test_closing_the_viewer_is_the_normal_end(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    viewer = StubViewer(3)
+    monkeypatch.setattr(mujoco_world, "check_display", lambda: None)
+    monkeypatch.setattr("mujoco.viewer.launch_passive", lambda *_, **__: viewer)
+    command = ["--export", str(folder), "--families", "rough", "--levels", "6", "--gui"]
+    assert runner.main(command) == 0
+    assert viewer.shown == 3 and viewer.cam.trackbodyid == 1
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_viewer_needs_a_display(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("DISPLAY", "")
+    assert runner.main(["--export", str(folder), "--gui"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("tdgc.mujoco: a window needs ") and said.count("\n") == 1
 
 
 @pytest.mark.parametrize(

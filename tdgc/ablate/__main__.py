@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from tdgc.ablate.table import Found, describe, rows
-from tdgc.ablate.trials import Runner, Tile, Trial, TrialError, uncalibrated
+from tdgc.ablate.trials import Runner, Tile, Trial, TrialError
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError, StoppedError, script
@@ -108,12 +108,16 @@ def check_trainings(runner: Runner, chosen: Sequence[Variant], seeds: Sequence[i
 
 
 def without_missing(chosen: Sequence[Variant], low: Path) -> list[Variant]:
-    """Leave out what needs an uncalibrated low policy if there is none beside ``low``."""
-    if uncalibrated(low).with_suffix(".json").is_file():
+    """Leave out what needs a low policy without its correction if it has none.
+
+    Raises:
+        ConfigError: the low policy cannot be used.
+    """
+    if load_low(low)[0].correction is not None:
         return list(chosen)
     left_out = [variant.name for variant in chosen if variant.low == "uncalibrated"]
     if left_out:
-        print(f"{' and '.join(left_out)} left out: there is no '{uncalibrated(low)}'")
+        print(f"{' and '.join(left_out)} left out: '{low}' has no correction")
     return [variant for variant in chosen if variant.low != "uncalibrated"]
 
 

@@ -32,8 +32,8 @@ def rows(
     Returns:
         For each variant, its ``name``, ``what`` and ``errors`` (seed -> message). If a trial is
         done, also the ``rates`` of all its seeds' episodes; ``families`` and ``seeds``, each ->
-        rate; ``versus``, the ``difference`` from ``full`` with the same seed; and, if it was
-        trained, the means of ``FACTS`` over the seeds.
+        rate; ``versus``, the ``difference`` from ``full`` with the same seed; and the means of
+        the ``Result.facts`` over the seeds.
     """
     of = np.array([family for family, _, _ in tiles])
     done = {trial: result for trial, result in found.items() if isinstance(result, Result)}
@@ -73,15 +73,18 @@ def describe(table: Sequence[dict[str, Any]]) -> str:
     wide = max(len(row["name"]) for row in table) + 1
     head = f"{'variant':<{wide}}{'n':>6}{'success':>9}{'95 %':>15}{'against full':>22}"
     head += "".join(f"{Path(family).stem[:8]:>9}" for family in families)
-    lines = [f"{head}{'steps':>9}{'hours':>7}"]
+    lines = [f"{head}{'steps':>9}{'walked':>9}{'trained':>9}{'evaluated':>11}"]
     for row in table:
         line = f"{row['name']:<{wide}}"
         if "n" in row:
             line += f"{row['n']:>6}{_percent(row['rate']):>8}%"
             line += f"{_interval(row):>15}{_versus(row['versus']):>22}"
             line += "".join(f"{_percent(row['families'][family]):>8}%" for family in families)
+            trained = " " * 27
             if "steps" in row:
-                line += f"{row['steps'] / 1e6:>8.2f}M{row['train_seconds'] / 3600.0:>7.2f}"
+                trained = f"{row['steps'] / 1e6:>8.2f}M{row['simulated_hours']:>7.1f} h"
+                trained += f"{row['train_seconds'] / 3600.0:>7.2f} h"
+            line += f"{trained}{row['evaluate_seconds'] / 60.0:>7.1f} min"
         else:
             line += "failed" if row["errors"] else "to come"
         lines.append(line.rstrip())

@@ -26,6 +26,7 @@ from tdgc.errors import FAILURES, InputError, StoppedError, what_stopped
 from tdgc.files import write_json
 from tdgc.learn.run import signals_restored
 from tdgc.parallel.cores import Workers
+from tdgc.policies.acting import without_correction
 from tdgc.sim.terrain import UNNAMED
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import OUTCOMES
@@ -33,8 +34,10 @@ from tdgc.tasks.tiles import FLAT
 
 #: Family, level and number of a tile.
 Tile = tuple[str, int, int]
-#: What is kept of a training: decisions, s, and h simulated, summed over all robots.
-FACTS = ("steps", "train_seconds", "simulated_hours")
+#: What is kept of an evaluation, s, and of a training: decisions, s, and h simulated, summed over
+#: all robots.
+EVALUATED = ("evaluate_seconds",)
+TRAINED = ("steps", "train_seconds", "simulated_hours")
 
 
 class TrialError(InputError):
@@ -59,7 +62,7 @@ class Result:
     """The result of a trial.
 
     Attributes:
-        facts: ``FACTS`` of its training; empty if nothing was trained.
+        facts: ``EVALUATED`` and, if it was trained, ``TRAINED``.
         reached: (n,) whether the goal was reached, in the order of ``Runner.tiles``.
     """
 
@@ -105,7 +108,7 @@ class Runner:
             if not self.done(trial):
                 self._complete(trial, folder)
             facts = read_json(folder / "cell.json")
-            kept = FACTS if trial.variant.settings is not None else ()
+            kept = EVALUATED + (TRAINED if trial.variant.settings is not None else ())
             return Result(
                 {name: _number(facts, name, folder / "cell.json") for name in kept},
                 _reached(folder / "evaluation" / "episodes.csv", self.tiles()),
@@ -130,11 +133,11 @@ class Runner:
             high = folder / "policy"
         elif trial.variant.policy == "tdgc":
             whole = self.out / f"{WHOLE}-{trial.seed}"
-            high = whole / "policy"
+            high = whole / trial.variant.high
             if not (whole / "cell.json").is_file():
                 raise TrialError(f"it needs '{WHOLE}' with seed {trial.seed}, which is missing")
-        elif trial.variant.policy == "teacher":
-            # At the speeds at which it taught ``full``, whatever its seed.
+        elif trial.variant.policy in ("cues", "teacher"):
+            # At the speeds at which the teacher taught ``full``, whatever its seed.
             done = min(self.out.glob(f"{WHOLE}-*/cell.json"), default=None)
             if done is not None and "teacher" in policies.load(done.with_name("policy")).meta:
                 high = done.with_name("policy")
@@ -222,11 +225,6 @@ def call(main: Callable[[list[str]], int], flags: Sequence[object]) -> None:
 # ---------------------------------------------------------------------------- policies
 
 
-def uncalibrated(low: Path) -> Path:
-    """Where train_low.py leaves the uncalibrated policy of its policy ``low``."""
-    return low.with_name("uncalibrated")
-
-
 def changed_pair(
     variant: Variant, low: Path, high: Path | None, folder: Path
 ) -> tuple[Path, Path | None]:
@@ -239,8 +237,11 @@ def changed_pair(
         OSError: a copy cannot be written.
     """
     if variant.low == "uncalibrated":
-        low = uncalibrated(low)
-        policies.load(low)
+        given = policies.load(low)
+        if given.correction is None:
+            raise InputError(f"'{low}' has no correction to leave out")
+        low = folder / "low"
+        policies.save_copy(low, without_correction(given), given.meta)
     elif variant.low == "fixed-pose":
         pose = {"robot": {"commanded_pose": False}}
         low = _copy(low, folder / "low", {"config": pose})

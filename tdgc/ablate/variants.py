@@ -18,6 +18,7 @@ class Variant:
         settings: of its training; None if nothing is trained.
         alone: further settings if all variants are trained without a teacher.
         low: the low policy: as given, without calibration, or with the paper's fixed nominal pose.
+        high: the high policy of ``full`` that a variant without training uses.
         policy: the policy to evaluate, as named by evaluate.py.
     """
 
@@ -26,7 +27,8 @@ class Variant:
     settings: tuple[str, ...] | None = None
     alone: tuple[str, ...] = ()
     low: Literal["given", "uncalibrated", "fixed-pose"] = "given"
-    policy: Literal["tdgc", "gp", "teacher"] = "tdgc"
+    high: Literal["policy", "imitation"] = "policy"
+    policy: Literal["tdgc", "gp", "cues", "teacher"] = "tdgc"
 
 
 def _discounts(seconds: float) -> tuple[str, ...]:
@@ -79,15 +81,18 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("no-clutter", "trained on the benchmark's families alone", (_NO_CLUTTER,)),
     Variant("no-exchange", "untold robots keep their memories", ("ppo.memory_exchange=0",)),
     Variant("no-teacher", "reinforcement learning alone", NO_TEACHER),
+    Variant("imitation", "right after imitation", high="imitation"),
     Variant("fixed-pose", "the paper's nominal pose", low="fixed-pose"),
     Variant("uncalibrated", "low policy not calibrated", low="uncalibrated"),
     Variant("gp", "the scripted baseline", policy="gp"),
     Variant("gp-fixed-pose", "the same, nominal pose", low="fixed-pose", policy="gp"),
     Variant("gp-uncalibrated", "the same, not calibrated", low="uncalibrated", policy="gp"),
+    Variant("cues", "a script that sees what the policy sees", policy="cues"),
     Variant("teacher", "the scripted teacher, which knows the tile", policy="teacher"),
 )
-#: Rows for trainings with a teacher: without one, every robot is told its family.
-WITH_TEACHER = ("no-exchange", "no-teacher")
+#: Rows for trainings with a teacher, next to each other: without one, every robot is told its
+#: family.
+WITH_TEACHER = ("no-exchange", "no-teacher", "imitation")
 #: Rows in their place with ``--no-teacher``: each undoes one setting that helps such a training.
 HELPS: tuple[Variant, ...] = (
     Variant("gait-per-decision", "noise of the gait not held", ("ppo.gait_hold=1",)),

@@ -37,6 +37,7 @@ from tdgc.sim.terrain import (
     Tile,
     is_map,
 )
+from tdgc.tasks.survey import corridor_at, find_trenches
 
 LAYERS = ("decisions", "execution", "terrain")
 
@@ -320,8 +321,8 @@ def features(tile: Tile, x: float, y: float) -> Iterator[tuple[str, float]]:
     """Yield the nearest trench, step and pillar, if the tile has any, each with its distance in m
     from (x, y) m in the tile's frame. Trenches and steps are numbered along the tile."""
     found = tile.features
-    if len(found.trenches):
-        away = to_trenches(tile, x)
+    away = to_trenches(tile, x)
+    if away.size:
         yield f"trench {away.argmin() + 1} of {away.size}", float(away.min())
     if len(found.risers):
         away = np.abs(x - found.risers[:, 0])
@@ -338,9 +339,17 @@ def _obstacle(family: str) -> str:
     return "an obstacle" if family in UNNAMED or is_map(family) else "a pillar"
 
 
+def trenches_of(tile: Tile) -> Array:
+    """Lips of the tile's trenches, (k, 2) m. A map lists none, so they are looked for."""
+    if not is_map(tile.family):
+        return tile.features.trenches
+    columns = CELL * np.arange(tile.heights.shape[1])
+    return find_trenches(tile.heights.astype(np.float64), corridor_at(columns))[0]
+
+
 def to_trenches(tile: Tile, x: ArrayLike) -> Array:
     """Distances along the tile, in m, from ``x`` (...) m to the k trenches, (..., k)."""
-    begin, end = tile.features.trenches.T
+    begin, end = trenches_of(tile).T
     along = np.asarray(x)[..., None]
     return np.maximum(np.maximum(begin - along, along - end), 0.0)
 

@@ -24,7 +24,7 @@ class Recording(EpisodeRecord):
         bounds: (12, 2) bounds of the continuous commands.
         position, quaternion: pose of the trunk in the tile's frame, (n, 3) m and (n, 4).
         q: (n, 12) rad, joint angles.
-        command: (n, 15) in force during the step.
+        command: (n, 15) as carried out during the step.
         velocity: (n, 3) forward and left in m/s, yaw rate in rad/s, like the first commands.
         height: (n,) m, trunk above the support surface under it.
         contact, desired: (n, 4) whether each foot is in contact, and whether the gait desires it.
@@ -79,7 +79,7 @@ class Recorder:
                 "position": state.position[rows] - self._origin,
                 "quaternion": state.quaternion[rows],
                 "q": state.q[rows],
-                "command": loco.command[rows],
+                "command": loco.carried_out[rows],
                 "velocity": np.column_stack([state.heading_vel[rows, :2], state.ang_vel[rows, 2]]),
                 "height": loco.world.trunk_height()[rows],
                 "contact": state.touching[rows],

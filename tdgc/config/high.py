@@ -1,7 +1,7 @@
 """The decision-level MDP (paper Sec. IV-B) and its curriculum (Sec. IV-C)."""
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 from tdgc.config.settings import Count, NotNegative, Positive, Share, Weight, Whole
 from tdgc.config.sim import CommandRanges, RandomisationConfig
@@ -16,6 +16,9 @@ class HighRewardConfig:
     Weights are per second: ``tdgc.tasks.high_rewards.high_terms`` multiplies them by the duration
     of a decision. With ``step_time_scaling`` off, they are per decision.
     """
+
+    #: Settings of earlier versions, which files may have recorded.
+    RETIRED: ClassVar[tuple[str, ...]] = ("goal_radius",)
 
     step_time_scaling: bool = field(default=True, metadata={"before": True})
 
@@ -32,7 +35,6 @@ class HighRewardConfig:
     map_radius: Positive = 8.0  # m, R_map: the tile's length
     curve_gain: Weight = 1.0  # a of the goal distance
     curve_rate: Positive = 3.0  # b of the goal distance
-    goal_radius: Positive = 0.5  # m, d_0: the paper's reach distance
     arrive_base: Weight = 1.0  # b_0
     arrive_speed: Weight = 2.0  # b_1: bonus for arriving early
     joint_speed_weight: NotNegative = 0.05  # beta of eta_t

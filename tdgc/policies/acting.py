@@ -231,6 +231,12 @@ def load(path: str | os.PathLike[str]) -> Policy:
         raise PolicyFileError(f"{path}: {error}") from None
 
 
+def without_correction(policy: Policy) -> Policy:
+    """The policy as it was before its calibration."""
+    tensors = {n: t for n, t in policy.tensors.items() if not n.startswith("correction.")}
+    return Policy(dataclasses.replace(policy.header, correction=()), tensors)
+
+
 def save_copy(
     path: str | os.PathLike[str],
     policy: Policy,

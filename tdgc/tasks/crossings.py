@@ -57,7 +57,7 @@ class Crossings:
 
     Attributes:
         flat: (M,) robots on flat tiles.
-        leapers: (M,) robots on tiles of Gap, which leap over the trenches.
+        leapers: (M,) robots on tiles with trenches, which they leap over.
         landing: that of the current low policy, learned from its leaps.
         spread: (M,) m, ``landing.spread`` as it was when each robot's leaps were planned.
     """
@@ -73,7 +73,7 @@ class Crossings:
         self._levels = config.levels
         self._low, self._high = command_bounds(config.commands).T
         self.flat = np.array([family == FLAT for family in families])
-        self.leapers = np.array([family == "gap" for family in families])
+        self.leapers = np.zeros(len(families), dtype=bool)
         self._plan = LeapPlan(len(families), config.commands, _CLEAR)
         self.landing = Landing()
         self.spread = np.zeros(len(families))
@@ -85,9 +85,11 @@ class Crossings:
 
     def plan(self, field: TileField, index: NDArray[np.integer]) -> None:
         """Plan the leaps of the robots ``index`` (n,) with the ``spread`` stored by ``look``."""
-        for i in index[self.leapers[index]]:
-            trenches = field.features[int(i)].trenches
-            self._plan.look(int(i), trenches, float(self.spread[i]))
+        for i in index.tolist():
+            trenches = field.features[i].trenches
+            self.leapers[i] = len(trenches) > 0
+            if self.leapers[i]:
+                self._plan.look(i, trenches, float(self.spread[i]))
 
     # ------------------------------------------------------------------ what is drawn
 

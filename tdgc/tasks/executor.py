@@ -48,6 +48,12 @@ class Executor:
 
     def step(self, commands: Array, rows: NDArray[np.integer] | None = None) -> None:
         """As ``Carries.step``: observe, ask the low policy, act."""
+        self.loco.act(self.decide(commands, rows))
+
+    def decide(
+        self, commands: Array, rows: NDArray[np.integer] | None = None
+    ) -> NDArray[np.float32]:
+        """What ``step`` does next, actions (M, 12)."""
         self.loco.command[:] = commands
         seen = self.loco.observe(self._noise)
         rows = np.arange(len(seen)) if rows is None else rows
@@ -56,4 +62,4 @@ class Executor:
         # Step all the same, with action 0: whoever checks its state then detects the blow-up.
         actions[~np.isfinite(actions).all(axis=1)] = 0.0
         self._actions[rows] = actions
-        self.loco.act(self._actions)
+        return self._actions

@@ -72,7 +72,7 @@ def survey(heights: NDArray[np.floating], left: float, goal: Array) -> Survey:
     """
     surface: Array = np.asarray(heights, dtype=np.float64)
     y = left + CELL * np.arange(surface.shape[1])
-    corridor = np.abs(y - TILE_SIZE / 2) < _CORRIDOR + 0.5 * CELL
+    corridor = corridor_at(y)
     trenches, ground = find_trenches(surface, corridor)
     low = _steps(ground, _LOW_STEP)
     high = _steps(ground, STEP, across=np.ones_like(corridor))
@@ -85,6 +85,11 @@ def survey(heights: NDArray[np.floating], left: float, goal: Array) -> Survey:
         price = price_near(np.minimum(clearance(high), border + RADIUS - _BESIDE), _WIDE)
         cost = travel_cost(np.maximum(price, np.where(beside, _STEP_PRICE, 1.0)), left, goal)
     return Survey(trenches, cost, lateral_slope(ground, low))
+
+
+def corridor_at(y: NDArray[np.floating]) -> Mask:
+    """Whether columns at ``y`` (n,) m are those that a robot has to pass, (n,)."""
+    return np.abs(y - TILE_SIZE / 2) < _CORRIDOR + 0.5 * CELL
 
 
 def find_trenches(heights: Array, corridor: Mask) -> tuple[Array, Array]:
