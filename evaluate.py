@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from tdgc.benchmark import diagnosis, tuning
+from tdgc.benchmark import behaviour, diagnosis, tuning
+from tdgc.benchmark.behaviour import Behaviour
 from tdgc.benchmark.cues import CuesLaw
 from tdgc.benchmark.diagnosis import Diagnosis, diagnose
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, TeacherDriver, load_high
@@ -280,8 +281,8 @@ class Evaluation:
         if self.mode == "tracking":
             make_folder(self.out)
         elif self.mode == "table":
-            left = ["traces/*.parquet", "diagnosis.csv", "tuning.json", report.NAME]
-            left += [name for name, *_ in report.FIGURES]
+            left = ["traces/*.parquet", "diagnosis.csv", "behaviour.csv", "tuning.json"]
+            left += [report.NAME, *(name for name, *_ in report.FIGURES)]
             make_room(self.out, left, {"films": self.filmed > 0, "traces": self.traced is not None})
 
 
@@ -293,12 +294,14 @@ class Ran:
         episodes: all of the batch.
         recordings: of the episodes to be filmed.
         diagnoses: of failures; empty if nothing is traced.
+        behaviours: of all episodes; empty if nothing is traced.
         traces: those to be written.
     """
 
     episodes: list[Episode]
     recordings: list[Recording]
     diagnoses: list[Diagnosis]
+    behaviours: list[Behaviour]
     traces: list[Trace]
 
 
@@ -315,7 +318,7 @@ def run_one(
     recorder = Recorder(driver, filmed)
     if traced is None:
         episodes = run_cell(cell, low, driver, seed, [recorder])
-        return Ran(episodes, recorder.recordings(), [], [])
+        return Ran(episodes, recorder.recordings(), [], [], [])
     tracer = Tracer(driver)
     episodes = run_cell(cell, low, driver, seed, [tracer, recorder])
     traces, hips = tracer.traces(), float(read_geometry(mdp_of(low).robot).hips[0, 0])
@@ -323,6 +326,7 @@ def run_one(
         episodes,
         recorder.recordings(),
         [diagnose(trace, hips) for trace in traces if trace.outcome != "reached"],
+        [behaviour.behaviour(trace) for trace in traces],
         [trace for trace in traces if traced.includes(trace)],
     )
 
@@ -349,6 +353,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     episodes: list[Episode] = []
     recordings: list[Recording] = []
     diagnoses: list[Diagnosis] = []
+    behaviours: list[Behaviour] = []
     with salvage(out, episodes, cells, trained_on) as bar:
         for ran in e.run_jobs(work, cells, e.workers):
             for trace in ran.traces:
@@ -356,6 +361,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
             episodes += ran.episodes
             recordings += ran.recordings
             diagnoses += ran.diagnoses
+            behaviours += ran.behaviours
             bar.update(len(ran.episodes))
     print(describe(write_results(out, episodes, trained_on)))
     plots.success_by_level(out / "summary.json", out / "success.png")
@@ -365,6 +371,8 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     if e.traced is not None:
         diagnosis.write(diagnoses, out / "diagnosis.csv")
         print(f"\n{diagnosis.describe(diagnoses, episodes)}")
+        behaviour.write(behaviours, out / "behaviour.csv")
+        print(f"\n{behaviour.describe(behaviours)}")
     if e.tuning is not None:
         effect = tuning.effect(episodes, "tdgc", TUNED)
         result = {"tuning": tuning.record(e.tuning), "effect": effect}

@@ -418,7 +418,12 @@ def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
     assert [(d["episode"], d["outcome"]) for d in diagnosed] == [
         (r["episode"], r["outcome"]) for r in failed
     ]
-    assert "largest possible gain: gap, decisions, 100.0 points" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "largest possible gain: gap, decisions, 100.0 points" in said
+    with open(tmp_path / "behaviour.csv", newline="", encoding="utf-8") as file:
+        walked = list(csv.DictReader(file))  # of all episodes, failed or not
+    assert [(w["episode"], w["trot"]) for w in walked] == [(r["episode"], "1.0000") for r in rows]
+    assert "how gp walks, nominal" in said
     # Fewer traces in the same folder: the old ones are removed.
     assert evaluate.main([*flags, "--trace", "1"]) == 0
     assert [p.name for p in (tmp_path / "traces").iterdir()] == ["gp_nominal_gap_10_000.parquet"]
@@ -427,6 +432,7 @@ def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
     assert evaluate.main(flags) == 0
     assert (tmp_path / "episodes.csv").read_bytes() == before
     assert not (tmp_path / "diagnosis.csv").exists() and not list((tmp_path / "traces").iterdir())
+    assert not (tmp_path / "behaviour.csv").exists()
 
 
 def test_without_pyarrow_the_script_says_what_to_install(tmp_path, monkeypatch, capsys):
