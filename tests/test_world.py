@@ -458,9 +458,9 @@ def test_feet_do_not_sink(family: str) -> None:
     """At most 0.1 % of foot samples are more than 1 cm below the surface of level 10.
 
     Actions are drawn from their full range at every control step; robots that fall or leave their
-    tile restart elsewhere. On stairs, where risers catch feet, the limit is 0.15 % (0.12 % measured
-    over nine seeds). Three seeds are pooled, because a single foot caught in a wall makes up 0.1 %
-    of one seed's samples.
+    tile restart elsewhere. On stairs, where risers catch feet, it is 0.11 % of 30 seeds' samples:
+    the benchmark's limit is missed there, and the limit here is 0.15 %. Three seeds are pooled,
+    because a single foot caught in a wall makes up 0.1 % of one seed's samples.
     """
     samples, sunk = np.sum([sinking(family, seed) for seed in (10, 11, 12)], axis=0)
     assert samples > 46_500

@@ -69,10 +69,10 @@ class PhysicsConfig:
     """Bullet's settings (benchmark, Physics)."""
 
     control_dt: Positive = 0.02  # s: 50 Hz control
-    # 2.5 ms: at most 0.1 % of foot samples sink more than 1 cm, on stairs 0.12 %.
+    # 2.5 ms: at most 0.1 % of foot samples sink more than 1 cm (benchmark), but 0.11 % on stairs.
     substeps: Count = 8
     # Physics steps for which a joint torque is held: 200 Hz joint control (benchmark). It saves 8 %
-    # of the time of a control step, and feet sink no deeper (docs/experiments.md).
+    # of the time of a control step, and no more feet sink (docs/experiments.md).
     hold: Count = field(default=2, metadata={"before": 1})
     solver_iterations: Count = 10  # as in the sinking test
     friction: NotNegative = 0.8  # foot on ground, nominal (benchmark)
