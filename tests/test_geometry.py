@@ -20,6 +20,7 @@ from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import PhaseClock, foot_phases, swing_profile
 from tdgc.sim.geometry import FRONT, SIDE, read_geometry
 from tdgc.sim.robot import (
+    check_nominal_pose,
     commanded_pose,
     fitted,
     foot_kinematics,
@@ -109,11 +110,51 @@ def test_settings_for_another_robot(a1: RobotConfig, robot: RobotConfig) -> None
     """The A1: 12.458 kg to our 12.6, legs of 0.4 m to our 0.426, motor limits from its URDF."""
     found = fitted(a1)
     assert found == {
+        "nominal_thigh": (0.8, 1.0), "nominal_calf": -1.5,
         "base_height": 0.28, "stance": (0.38, 0.26), "kp": 18.6, "kd": 0.54,
         "torque_limit": (20.0, 55.0, 55.0), "speed_limit": (52.4, 28.6, 28.6),
     }  # fmt: skip
     assert fitted(robot)["stance"] == (0.44, 0.3)
     assert fitted(robot)["kp"] == pytest.approx(20.0 * 15.4 / 12.6 * 0.5 / 0.426, abs=0.05)
+
+
+def sagittal_feet(config: RobotConfig) -> np.ndarray:
+    """Feet of the nominal pose ahead of and above the thigh joints, front and rear, (2, 2) m."""
+    geometry = read_geometry(config)
+    thigh, calf = np.array(config.nominal_thigh), config.nominal_calf
+    ahead = -geometry.thigh * np.sin(thigh) - geometry.calf * np.sin(thigh + calf)
+    up = -geometry.thigh * np.cos(thigh) - geometry.calf * np.cos(thigh + calf)
+    return np.stack([ahead, up], axis=1)
+
+
+def test_the_nominal_pose_fits_the_legs(tmp_path: Path) -> None:
+    """With calves of 0.26 m instead of 0.213, feet are where ours are but 11 % further away."""
+    foot = 'name="rubber"/></visual>\n    <collision><origin xyz="0 0 -0.{}"'
+    long = changed(tmp_path, (foot.format(213), foot.format(26)))
+    assert read_geometry(long).calf == pytest.approx(0.26)
+    found = fitted(long)
+    fits = dataclasses.replace(
+        long, nominal_thigh=found["nominal_thigh"], nominal_calf=found["nominal_calf"]
+    )
+    expected = sagittal_feet(RobotConfig()) * (0.213 + 0.26) / 0.426
+    np.testing.assert_allclose(sagittal_feet(fits), expected, atol=0.004)
+    assert np.abs(sagittal_feet(long) - expected).max() > 0.02  # with our angles
+    # Whoever has set another pose keeps it, and the height is that of this pose.
+    own = fitted(dataclasses.replace(long, nominal_calf=-1.2))
+    assert own["nominal_calf"] == -1.2 and own["base_height"] > found["base_height"]
+
+
+def test_the_nominal_pose_keeps_the_calf_within_its_limits(tmp_path: Path) -> None:
+    stiff = changed(tmp_path, ('upper="-0.89"', 'upper="-1.8"'))
+    found = fitted(stiff)
+    assert found["nominal_calf"] == pytest.approx(-1.82)
+    # The feet stay on the same ray from the thigh joints.
+    fits = dataclasses.replace(
+        stiff, nominal_thigh=found["nominal_thigh"], nominal_calf=found["nominal_calf"]
+    )
+    rays = [np.arctan2(*sagittal_feet(config).T) for config in (RobotConfig(), fits)]
+    np.testing.assert_allclose(rays[0], rays[1], atol=0.006)
+    check_nominal_pose(fits, read_geometry(fits))
 
 
 def test_the_gains_of_a_light_robot_are_not_rounded_to_zero(tmp_path: Path) -> None:
@@ -126,7 +167,8 @@ def test_the_gains_of_a_light_robot_are_not_rounded_to_zero(tmp_path: Path) -> N
 def test_a_urdf_that_says_nothing_of_its_motors(tmp_path: Path) -> None:
     hips_and_thighs, calves = (' effort="23.7" velocity="30"', ""), (' effort="35.5"', "")
     silent = changed(tmp_path, hips_and_thighs, calves, (' velocity="20"', ""))
-    assert set(fitted(silent)) == {"base_height", "stance", "kp", "kd"}
+    posture = {"nominal_thigh", "nominal_calf", "base_height", "stance"}
+    assert set(fitted(silent)) == posture | {"kp", "kd"}
     # What it says of some joints counts; the others have the shipped robot's limits.
     partly = changed(tmp_path, hips_and_thighs, (' effort="35.5"', ' effort="80"'))
     assert fitted(partly)["torque_limit"] == (23.7, 23.7, 80.0)

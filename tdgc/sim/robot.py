@@ -5,7 +5,7 @@ Arrays have a leading axis of M robots. Legs are in the order of ``tdgc.sim.gait
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -69,21 +69,57 @@ def _rounded(value: float, places: int) -> float:
     return round(value, max(places, 1 - math.floor(math.log10(value))))
 
 
+def _bend(thigh: float, calf: float, reach: float) -> float:
+    """Angle of the calf joint at which the foot is ``reach`` m from the thigh joint, rad."""
+    cosine = (reach**2 - thigh**2 - calf**2) / (2.0 * thigh * calf)
+    return -math.acos(min(max(cosine, -1.0), 1.0))
+
+
+def _reach_and_lean(thigh: float, calf: float, bend: float) -> tuple[float, float]:
+    """Distance in m from the thigh joint to the foot of a leg whose calf is at ``bend`` rad, and
+    the angle in rad by which the way there leans forward of the thigh."""
+    along, across = thigh + calf * math.cos(bend), calf * math.sin(bend)
+    return math.hypot(along, across), -math.atan2(across, along)
+
+
+def _nominal_legs(own: Geometry) -> tuple[tuple[float, float], float]:
+    """``nominal_thigh`` and ``nominal_calf`` with which the feet are where the shipped robot's are
+    below the thigh joints, scaled with the legs' length; the calf stays within its limits."""
+    ours = RobotConfig()
+    shipped = read_geometry(ours)
+    reach, lean = _reach_and_lean(shipped.thigh, shipped.calf, ours.nominal_calf)
+    reach *= (own.thigh + own.calf) / (shipped.thigh + shipped.calf)
+    lowest, highest = own.joint_limits[2::3].T
+    margin = ours.joint_margin or 0.0
+    calf = round(_bend(own.thigh, own.calf, reach), 2)
+    calf = min(max(calf, float(lowest.max()) + margin), float(highest.min()) - margin)
+    change = _reach_and_lean(own.thigh, own.calf, calf)[1] - lean
+    front, rear = (round(thigh + change, 2) for thigh in ours.nominal_thigh)
+    return (front, rear), calf
+
+
 def fitted(config: RobotConfig) -> dict[str, Any]:
     """Settings for the robot whose URDF ``config`` names, by field: motor limits from the URDF, and
     the shipped robot's settings scaled to its size and mass.
 
-    ``base_height`` is the same share of the nominal pose's height, ``stance`` of the distances
-    between the thigh joints. ``kp`` scales with the weight's
+    In the nominal pose, unless ``config`` has another than the default, the feet are below the
+    thigh joints as the shipped robot's are. ``base_height`` is the same share of that pose's
+    height, ``stance`` of the distances between the thigh joints. ``kp`` scales with the weight's
     torque about the joints, m g l, and ``kd`` with m l^1.5, which keeps the damping ratio.
     """
     ours, own = RobotConfig(), read_geometry(config)
     shipped = read_geometry(ours)
     mass = sum(own.masses.values()) / sum(shipped.masses.values())
     length = (own.thigh + own.calf) / (shipped.thigh + shipped.calf)
-    height = nominal_height(config, own) / nominal_height(ours, shipped)
+    thigh, calf = config.nominal_thigh, config.nominal_calf
+    if (thigh, calf) == (ours.nominal_thigh, ours.nominal_calf):
+        thigh, calf = _nominal_legs(own)
+    posed = replace(config, nominal_thigh=thigh, nominal_calf=calf)
+    height = nominal_height(posed, own) / nominal_height(ours, shipped)
     stance = np.multiply(ours.stance, _between_thighs(own) / _between_thighs(shipped))
     found: dict[str, Any] = {
+        "nominal_thigh": thigh,
+        "nominal_calf": calf,
         "base_height": round(height * ours.base_height, 2),
         "stance": tuple(stance.round(2).tolist()),
         "kp": _rounded(mass * length * ours.kp, 1),
