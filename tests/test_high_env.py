@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from test_drivers import put_before_trenches
 
 import tdgc  # noqa: F401  registers the environments
 from tdgc.config import (
@@ -393,6 +394,7 @@ def test_a_teacher_says_what_can_be_said_of_what_it_does():
     task = NavigationTask(config, LOW_POLICY, 2, seed=0, taught=Skill(Landing()), led=6)
     try:
         task.reset(np.arange(2))
+        put_before_trenches(task)
         size = width(high_layout(CONFIG))
         taught = task.decoder.decode(task.observe()[:, size : size + 13].astype(float))
         wanted = task.teacher.commands(task.locomotion, task.goal)
