@@ -26,12 +26,19 @@ from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, Teac
 from tdgc.benchmark.evaluation import CONDITIONS, Cell, Episode, plan, run_cell
 from tdgc.benchmark.flags import add_arguments, choose, resolve
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import EDITIONS, describe, make_room, salvage, write_results
+from tdgc.benchmark.results import (
+    EDITIONS,
+    describe,
+    editions_of,
+    make_room,
+    salvage,
+    write_results,
+)
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
-from tdgc.errors import InputError, require, script
+from tdgc.errors import require, script
 from tdgc.files import make_folder, write_json
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
@@ -389,22 +396,12 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
 
 
 def editions(low: Policy, drivers: Mapping[str, Driver]) -> dict[str, int]:
-    """Editions of the benchmark that the policies were trained on.
-
-    Policies that do not record an edition are of the first.
-
-    Raises:
-        InputError: a policy's file has something else in place of an edition.
-    """
-    used = {"low": low}
+    """Editions of the benchmark that the policies were trained on, see ``editions_of``."""
+    used = {"low": low.meta}
     pair = drivers.get("tdgc")
     if isinstance(pair, HierarchyDriver) and isinstance(pair.high, Policy):
-        used["high"] = pair.high
-    found = {name: policy.meta.get("benchmark", 1) for name, policy in used.items()}
-    for name, edition in found.items():
-        if type(edition) is not int:
-            raise InputError(f"the {name} policy's 'benchmark' must be an edition, not {edition!r}")
-    return found
+        used["high"] = pair.high.meta
+    return editions_of(used)
 
 
 def print_effect(effect: dict[str, Any]) -> None:

@@ -13,9 +13,9 @@ from tdgc.benchmark.evaluation import EpisodeRecord
 from tdgc.benchmark.trace import Trace
 from tdgc.files import atomic
 from tdgc.sim.gaits import GAITS
-from tdgc.sim.robot import wrap_angle
+from tdgc.sim.robot import Array, wrap_angle
 
-_MOVING = 0.1  # m/s; the direction of slower motion is mostly sway. Chosen by hand.
+_MOVING = 0.1  # m/s, below which the direction of travel is undefined (v_th of the high rewards)
 _COMMANDED = ("frequency", "swing_height", "stance_width")
 #: Means over an episode, the columns of behaviour.csv behind those that identify it: shares of the
 #: time in each gait; of the time in motion, more than 45 degrees away from the heading to a side,
@@ -36,20 +36,36 @@ class Behaviour(EpisodeRecord):
     means: dict[str, float]
 
 
+def heading_to_travel(x: Array, y: Array, yaw: Array, seconds: Array | float) -> Array:
+    """Heading relative to the direction of travel between n successive poses, (n - 1,) rad.
+
+    At 0 the robot moves forwards, at pi backwards, at pi/2 to its right: the nose points to the
+    left of the direction of travel. NaN while it hardly moves.
+
+    Args:
+        x, y: (n,) m.
+        yaw: (n,) rad.
+        seconds: s between poses, (n - 1,) or a scalar.
+    """
+    dx, dy = np.diff(x), np.diff(y)
+    heading = yaw[:-1] + 0.5 * wrap_angle(np.diff(yaw))
+    moving = np.hypot(dx, dy) > _MOVING * seconds
+    return np.where(moving, wrap_angle(heading - np.arctan2(dy, dx)), np.nan)
+
+
 def behaviour(trace: Trace) -> Behaviour:
     """Summarise how the robot walked in the episode of ``trace``, which was on a tile."""
     seconds = trace["seconds"][1:].astype(np.float64)
-    east, north = np.diff(trace["base_x"]), np.diff(trace["base_y"])
-    covered = np.hypot(east, north)
-    moving = covered > _MOVING * seconds
-    off = np.abs(wrap_angle(np.arctan2(north, east) - trace["yaw"][:-1]))
-    aside, behind = off > np.pi / 4, off > 3 * np.pi / 4
+    x, y, yaw = (trace[name].astype(np.float64) for name in ("base_x", "base_y", "yaw"))
+    covered = np.hypot(np.diff(x), np.diff(y))
+    off = np.abs(heading_to_travel(x, y, yaw, seconds))
+    moving, aside, behind = np.isfinite(off), off > np.pi / 4, off > 3 * np.pi / 4
 
     def mean(values: NDArray[np.floating] | NDArray[np.bool_]) -> float:
         return float(np.average(values, weights=seconds))
 
     def in_motion(flags: NDArray[np.bool_]) -> float:
-        return float(seconds[moving & flags].sum() / max(seconds[moving].sum(), 1e-9))
+        return float(seconds[flags].sum() / max(seconds[moving].sum(), 1e-9))
 
     means = {gait: mean(trace["gait"][:-1] == gait) for gait in GAITS}
     means |= {"sideways": in_motion(aside & ~behind), "backward": in_motion(behind)}

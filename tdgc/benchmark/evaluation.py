@@ -245,7 +245,7 @@ class Batch:
 
     Attributes:
         cell, seed: as given.
-        field: (M, 1) tiles.
+        field: M tiles.
         loco: the robots, at their starts.
         goal: (M, 2) m in the world.
         origin: (M, 2) m, origins of the tiles in the world.

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
+from tdgc.errors import InputError
 from tdgc.files import atomic, make_folder, write_json
 from tdgc.sim.terrain import EDITION
 
@@ -144,6 +145,21 @@ def describe(summary: dict[str, Any]) -> str:
                 f"are of edition {EDITION}",
             ]
     return "\n".join(lines)
+
+
+def editions_of(metas: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
+    """Editions of the benchmark that policies were trained on, from what their files record.
+
+    Policies that do not record an edition are of the first.
+
+    Raises:
+        InputError: a policy's file has something else in place of an edition.
+    """
+    found = {name: meta.get("benchmark", 1) for name, meta in metas.items()}
+    for name, edition in found.items():
+        if type(edition) is not int:
+            raise InputError(f"the {name} policy's 'benchmark' must be an edition, not {edition!r}")
+    return found
 
 
 def policies_of(summary: dict[str, Any]) -> dict[str, Any]:

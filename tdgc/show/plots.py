@@ -20,13 +20,14 @@ from matplotlib.patches import Circle, Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
+from tdgc.benchmark import behaviour
 from tdgc.benchmark.evaluation import POSE_SECONDS, tile_of
 from tdgc.benchmark.recording import Recording, runs_of_equal, spans
 from tdgc.benchmark.results import policies_of
 from tdgc.files import atomic
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
-from tdgc.sim.robot import Array, wrap_angle
+from tdgc.sim.robot import Array
 from tdgc.sim.terrain import TILE_SIZE
 from tdgc.tasks.rules import GOAL_RADIUS
 
@@ -38,7 +39,6 @@ POLICY_COLOURS = {
 GAIT_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7")
 _GROUND = LinearSegmentedColormap.from_list("ground", ["#ffffff", "#707070"])  # low to high
 
-_MOVING = 0.1  # m/s, below which the direction of travel is undefined (v_th of the high rewards)
 _SECTORS = 24  # of 15 degrees each
 _DRAWN = 3  # episodes per family and policy in the figure of trajectories
 
@@ -175,20 +175,15 @@ def gait_shares(folder: Path, out: Path) -> None:
 
 
 def heading_to_travel(track: Array) -> Array:
-    """Compute the heading relative to the direction of travel, (k,) rad, while the robot moves.
-
-    At 0 it moves forwards, at pi backwards, at pi/2 to its right: the nose points to the left of
-    the direction of travel.
+    """``behaviour.heading_to_travel`` while the robot moves, (k,) rad.
 
     Args:
         track: (n, 3) as in ``tdgc.benchmark.evaluation.Episode``. The last pose is left out,
             because it may come less than ``POSE_SECONDS`` after the one before.
     """
     x, y, yaw = track[:-1].T
-    dx, dy = np.diff(x), np.diff(y)
-    heading = yaw[:-1] + 0.5 * wrap_angle(np.diff(yaw))
-    moving = np.hypot(dx, dy) > _MOVING * POSE_SECONDS
-    return wrap_angle(heading - np.arctan2(dy, dx))[moving]
+    angles = behaviour.heading_to_travel(x, y, yaw, POSE_SECONDS)
+    return angles[np.isfinite(angles)]
 
 
 def headings(folder: Path, out: Path) -> None:

@@ -69,33 +69,22 @@ def _rounded(value: float, places: int) -> float:
     return round(value, max(places, 1 - math.floor(math.log10(value))))
 
 
-def _bend(thigh: float, calf: float, reach: float) -> float:
-    """Angle of the calf joint at which the foot is ``reach`` m from the thigh joint, rad."""
-    cosine = (reach**2 - thigh**2 - calf**2) / (2.0 * thigh * calf)
-    return -math.acos(min(max(cosine, -1.0), 1.0))
-
-
-def _reach_and_lean(thigh: float, calf: float, bend: float) -> tuple[float, float]:
-    """Distance in m from the thigh joint to the foot of a leg whose calf is at ``bend`` rad, and
-    the angle in rad by which the way there leans forward of the thigh."""
-    along, across = thigh + calf * math.cos(bend), calf * math.sin(bend)
-    return math.hypot(along, across), -math.atan2(across, along)
-
-
 def _nominal_legs(own: Geometry) -> tuple[tuple[float, float], float]:
     """``nominal_thigh`` and ``nominal_calf`` with which the feet are where the shipped robot's are
     below the thigh joints, scaled with the legs' length; the calf stays within its limits."""
-    ours = RobotConfig()
-    shipped = read_geometry(ours)
-    reach, lean = _reach_and_lean(shipped.thigh, shipped.calf, ours.nominal_calf)
-    reach *= (own.thigh + own.calf) / (shipped.thigh + shipped.calf)
-    lowest, highest = own.joint_limits[2::3].T
-    margin = ours.joint_margin or 0.0
-    calf = round(_bend(own.thigh, own.calf, reach), 2)
-    calf = min(max(calf, float(lowest.max()) + margin), float(highest.min()) - margin)
-    change = _reach_and_lean(own.thigh, own.calf, calf)[1] - lean
-    front, rear = (round(thigh + change, 2) for thigh in ours.nominal_thigh)
-    return (front, rear), calf
+    upright = replace(RobotConfig(), nominal_hip=0.0)
+    shipped = read_geometry(upright)
+    feet = nominal_feet(upright, shipped)
+    feet[:, :2] -= shipped.hips
+    feet *= (own.thigh + own.calf) / (shipped.thigh + shipped.calf)
+    feet[:, 0] += own.hips[:, 0]
+    feet[:, 1] = own.hips[:, 1] + own.abduction * SIDE
+    limits = own.joint_limits.reshape(4, 3, 2)  # of one leg, the strictest of the four
+    inside = np.stack([limits[..., 0].max(axis=0), limits[..., 1].min(axis=0)], axis=1)
+    inside += np.multiply(upright.joint_margin or 0.0, [1.0, -1.0])
+    angles = leg_angles(replace(own, joint_limits=np.tile(inside, (4, 1))), feet[None])
+    front, _, rear, _ = angles.reshape(4, 3).round(2).tolist()
+    return (front[1], rear[1]), front[2]
 
 
 def fitted(config: RobotConfig) -> dict[str, Any]:

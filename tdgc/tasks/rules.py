@@ -35,7 +35,7 @@ def outcome(
     """How each robot's episode ends now, (M,): an index into ``OUTCOMES``, or ``GOING``.
 
     Failure takes precedence over success: a robot that falls into the goal has fallen. Robot i is
-    on tile (i, 0) of the world's field.
+    on tile i of the world's field.
 
     Args:
         world: the robots; on a plane, which has no field, there is no tile to leave.

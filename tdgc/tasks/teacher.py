@@ -150,7 +150,7 @@ class Teacher:
     """Commands M robots, each on a tile of its own.
 
     Args:
-        field: (M, 1) tiles.
+        field: M tiles.
         ranges: command ranges that the low policy was trained on.
         skill: of the low policy.
 

@@ -85,7 +85,7 @@ class TrainingTiles:
         alter: (tile, level) -> the tile to use instead.
 
     Attributes:
-        field: (M, 1) tiles.
+        field: M tiles.
         level, number, episodes: (M,) level of each robot's tile, the number it was drawn with (see
             ``tile_rng``), and how many episodes began on it.
         drawn: number of tiles drawn so far.
