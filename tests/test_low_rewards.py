@@ -17,6 +17,7 @@ from tdgc.tasks.low_rewards import LOW_TERMS, LowStep, low_terms, total
 
 E = math.exp
 GEOMETRY = read_geometry(RobotConfig())
+CONFIG = LowRewardConfig(sigma_lin=0.25, sigma_yaw=0.25)
 
 
 def low_step(**changes: object) -> LowStep:
@@ -37,10 +38,13 @@ def low_step(**changes: object) -> LowStep:
         acceleration=np.zeros((2, 12)),
         last_tilt=np.zeros((2, 2)),
         was_contact=np.zeros((2, 4), dtype=bool),
-        sigma_lin=0.25,
-        sigma_yaw=0.25,
+        config=CONFIG,
     )
     return dataclasses.replace(step, **changes)  # type: ignore[arg-type]
+
+
+def with_constants(step: LowStep, **constants: float) -> LowStep:
+    return dataclasses.replace(step, config=dataclasses.replace(step.config, **constants))
 
 
 def set_command(step: LowStep, **values: float) -> LowStep:
@@ -64,7 +68,7 @@ def test_tracking_a_velocity() -> None:
     step = set_command(low_step(), vx=0.5, vy=-0.2)
     # The first robot follows its command; the second is off by (0.5, -0.2): e^2 = 0.29.
     np.testing.assert_allclose(rewards.track_lin_vel(step), [1.0, E(-0.29 / 0.25)], atol=1e-12)
-    wide = dataclasses.replace(step, sigma_lin=1.0)
+    wide = with_constants(step, sigma_lin=1.0)
     np.testing.assert_allclose(rewards.track_lin_vel(wide), [1.0, E(-0.29)], atol=1e-12)
 
 
@@ -247,6 +251,9 @@ def test_swing_contact_force() -> None:
     step.state.foot_force[:] = [[50.0] * 4, [10.0, 10.0, 10.0, 0.0]]
     expected = (1.0 + 0.5) * (1.0 - E(-1.0)) / 4
     np.testing.assert_allclose(rewards.swing_contact_force(step), [0.0, expected], atol=1e-12)
+    hard = with_constants(step, swing_force_scale=400.0)
+    expected = (1.0 + 0.5) * (1.0 - E(-0.25)) / 4
+    np.testing.assert_allclose(rewards.swing_contact_force(hard), [0.0, expected], atol=1e-12)
 
 
 def test_stance_foot_speed() -> None:
@@ -254,6 +261,9 @@ def test_stance_foot_speed() -> None:
     step.state.foot_velocity[:, :3] = [1.0, 2.0, -1.0]
     expected = 1.5 * (1.0 - E(-0.6)) / 4
     np.testing.assert_allclose(rewards.stance_foot_speed(step), [0.0, expected], atol=1e-12)
+    fast = with_constants(step, stance_speed_scale=6.0)
+    expected = 1.5 * (1.0 - E(-1.0)) / 4
+    np.testing.assert_allclose(rewards.stance_foot_speed(fast), [0.0, expected], atol=1e-12)
 
 
 def test_foot_slip_counts_feet_in_contact_now_or_a_step_ago() -> None:
@@ -270,6 +280,7 @@ def test_leg_collision_counts_legs() -> None:
     step = low_step()
     step.state.leg_force[:] = [[0.0, 0.1, 0.0, 0.0], [0.2, 300.0, 0.0, 0.11]]
     assert rewards.leg_collision(step).tolist() == [0.0, 3.0]
+    assert rewards.leg_collision(with_constants(step, leg_force=0.2)).tolist() == [0.0, 1.0]
 
 
 # ------------------------------------------------------------------ joints and actions
@@ -296,6 +307,8 @@ def test_joint_limits_cost_beyond_nine_tenths_of_the_range() -> None:
     expected = 0.05 * (high[0] - low[0]) + 0.05 * (high[1] - low[1]) + 0.1
     assert expected == pytest.approx(0.086 + 0.2595 + 0.1)
     np.testing.assert_allclose(rewards.joint_limits(step), [0.0, expected], atol=1e-12)
+    whole = with_constants(step, soft_limit=1.0)  # only the angle beyond its range counts
+    np.testing.assert_allclose(rewards.joint_limits(whole), [0.0, 0.1], atol=1e-12)
 
 
 def test_torques_speeds_accelerations_and_power() -> None:
@@ -318,6 +331,7 @@ def test_table_and_configuration_name_the_same_terms() -> None:
     fields = {f.name for f in dataclasses.fields(LowRewardConfig)}
     assert set(LOW_TERMS) | {
         "sigma_lin", "sigma_yaw", "walking_penalty", "terrain_penalty",
+        "swing_force_scale", "stance_speed_scale", "leg_force", "soft_limit",
     } == fields  # fmt: skip
     assert all(LOW_TERMS[name].__name__ == name for name in LOW_TERMS)
     weights = LowRewardConfig()

@@ -19,7 +19,8 @@ from tdgc.config.sim import CommandRanges, PhysicsConfig, RandomisationConfig, R
 
 @dataclass(frozen=True)
 class LowRewardConfig:
-    """Weights of the low policy's reward, one per term of ``tdgc.tasks.low_rewards.LOW_TERMS``.
+    """Weights of the low policy's reward, one per term of ``tdgc.tasks.low_rewards.LOW_TERMS``, and
+    its constants.
 
     Penalties are those of Walk These Ways (its published table), some changed by up to a factor of
     two where the first policies showed the need (docs/experiments.md). ``power`` is our own; it is
@@ -54,6 +55,13 @@ class LowRewardConfig:
     # 0.5; with those the policy walked at only 0.3-0.8 of the commanded velocity.
     sigma_lin: Positive = 0.1  # m^2/s^2
     sigma_yaw: Positive = 0.15  # rad^2/s^2
+    # These four are of Walk These Ways, too.
+    swing_force_scale: Positive = field(default=100.0, metadata={"before": 100.0})  # N^2
+    stance_speed_scale: Positive = field(default=10.0, metadata={"before": 10.0})  # m^2/s^2
+    # N, above which a contact of a leg above its foot counts.
+    leg_force: NotNegative = field(default=0.1, metadata={"before": 0.1})
+    # Share of a joint's range, around its middle, without a penalty.
+    soft_limit: Share = field(default=0.9, metadata={"before": 0.9})
     # Share of the penalties that remains once a gait's velocity ranges have grown to their full
     # width. Full penalties teach the gait, but later they reward walking more slowly than commanded
     # (docs/experiments.md).

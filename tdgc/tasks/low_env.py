@@ -237,8 +237,7 @@ class LowLevelTask:
             acceleration=(loco.world.state.qd - speed_before) / c.physics.control_dt,
             last_tilt=self._last_tilt(command[:, INDEX["frequency"]]),
             was_contact=self.episodes.was_contact,
-            sigma_lin=c.rewards.sigma_lin,
-            sigma_yaw=c.rewards.sigma_yaw,
+            config=c.rewards,
         )
 
     def _last_tilt(self, frequency: Array) -> Array:

@@ -18,11 +18,7 @@ from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.geometry import FRONT, SIDE
 from tdgc.sim.robot import Array, RobotState, foot_travel
 
-_SOFT_LIMIT = 0.9  # share of a joint's range without a penalty (Walk These Ways)
-_FORCE_SCALE = 100.0  # N^2, swing contact force (Walk These Ways)
-_FOOT_SPEED_SCALE = 10.0  # m^2/s^2, stance foot speed (Walk These Ways)
 _STANCE = [INDEX["stance_length"], INDEX["stance_width"]]
-_LEG_FORCE = 0.1  # N, above which a leg contact counts (Walk These Ways)
 
 
 @dataclass
@@ -43,7 +39,7 @@ class LowStep:
         acceleration: (M, 12) rad/s^2 of the joints over the step.
         last_tilt: (M, 2) x and y of gravity in the trunk's frame one gait cycle ago.
         was_contact: (M, 4) bool, contact at the previous step.
-        sigma_lin, sigma_yaw: scales of the tracking terms.
+        config: the constants.
     """
 
     state: RobotState
@@ -60,8 +56,7 @@ class LowStep:
     acceleration: Array
     last_tilt: Array
     was_contact: Array
-    sigma_lin: float
-    sigma_yaw: float
+    config: LowRewardConfig
 
     def cmd(self, name: str) -> Array:
         """One command by name, (M,)."""
@@ -75,12 +70,14 @@ def square_sum(x: Array) -> Array:
 
 def track_lin_vel(s: LowStep) -> Array:
     """r_lin = exp(-|v_xy - v_xy^cmd|^2 / sigma_lin), velocities in the heading frame."""
-    return np.exp(-square_sum(s.state.heading_vel[:, :2] - s.command[:, :2]) / s.sigma_lin)
+    error = square_sum(s.state.heading_vel[:, :2] - s.command[:, :2])
+    return np.exp(-error / s.config.sigma_lin)
 
 
 def track_yaw_rate(s: LowStep) -> Array:
     """r_yaw = exp(-(omega_z - omega_z^cmd)^2 / sigma_yaw)."""
-    return np.exp(-((s.state.ang_vel[:, 2] - s.cmd("yaw_rate")) ** 2) / s.sigma_yaw)
+    error = (s.state.ang_vel[:, 2] - s.cmd("yaw_rate")) ** 2
+    return np.exp(-error / s.config.sigma_yaw)
 
 
 def body_height(s: LowStep) -> Array:
@@ -129,16 +126,15 @@ def swing_height(s: LowStep) -> Array:
 
 
 def swing_contact_force(s: LowStep) -> Array:
-    """Contact in swing: mean of (1 - C)(1 - exp(-F^2 / 100 N^2))."""
-    return np.mean(
-        (1.0 - s.contact) * (1.0 - np.exp(-(s.state.foot_force**2) / _FORCE_SCALE)), axis=1
-    )
+    """Contact in swing: mean of (1 - C)(1 - exp(-F^2 / swing_force_scale))."""
+    pressed = 1.0 - np.exp(-(s.state.foot_force**2) / s.config.swing_force_scale)
+    return np.mean((1.0 - s.contact) * pressed, axis=1)
 
 
 def stance_foot_speed(s: LowStep) -> Array:
-    """Motion in stance: mean of C (1 - exp(-|v_foot|^2 / 10 m^2/s^2))."""
+    """Motion in stance: mean of C (1 - exp(-|v_foot|^2 / stance_speed_scale))."""
     speed2 = square_sum(s.state.foot_velocity)
-    return np.mean(s.contact * (1.0 - np.exp(-speed2 / _FOOT_SPEED_SCALE)), axis=1)
+    return np.mean(s.contact * (1.0 - np.exp(-speed2 / s.config.stance_speed_scale)), axis=1)
 
 
 def target_rate(s: LowStep) -> Array:
@@ -164,14 +160,14 @@ def foot_slip(s: LowStep) -> Array:
 
 def leg_collision(s: LowStep) -> Array:
     """Number of legs in contact above the foot."""
-    return np.sum(s.state.leg_force > _LEG_FORCE, axis=1).astype(np.float64)
+    return np.sum(s.state.leg_force > s.config.leg_force, axis=1).astype(np.float64)
 
 
 def joint_limits(s: LowStep) -> Array:
-    """How far joints are outside the middle 0.9 of their range, summed, rad."""
+    """How far joints are outside the middle ``soft_limit`` of their range, summed, rad."""
     limits = s.state.geometry.joint_limits
     middle = limits.mean(axis=1)
-    half = 0.5 * _SOFT_LIMIT * (limits[:, 1] - limits[:, 0])
+    half = 0.5 * s.config.soft_limit * (limits[:, 1] - limits[:, 0])
     return np.sum(np.maximum(np.abs(s.state.q - middle) - half, 0.0), axis=1)
 
 
@@ -237,8 +233,11 @@ LOW_TERMS: dict[str, Callable[[LowStep], Array]] = {
         power,
     )
 }
-_NO_TERMS = {"sigma_lin", "sigma_yaw", "walking_penalty", "terrain_penalty"}
-if set(LOW_TERMS) != {f.name for f in dataclasses.fields(LowRewardConfig)} - _NO_TERMS:
+_CONSTANTS = {
+    "sigma_lin", "sigma_yaw", "swing_force_scale", "stance_speed_scale", "leg_force", "soft_limit",
+    "walking_penalty", "terrain_penalty",
+}  # fmt: skip
+if set(LOW_TERMS) != {f.name for f in dataclasses.fields(LowRewardConfig)} - _CONSTANTS:
     raise TypeError("LOW_TERMS and LowRewardConfig name different terms")
 
 
