@@ -15,6 +15,7 @@ from tdgc.learn.recurrent import (
     FastRecurrentPPO,
     GaitNoise,
     MemoryExchange,
+    actor_parameters,
     exchange_memories,
     gait_entropy,
 )
@@ -52,7 +53,10 @@ class MemoryEnv(gym.Env):
 def make_model(policy, batch_size: int = 24, **kwargs) -> FastRecurrentPPO:
     """Make a learner, by default with two minibatches, of three environments and of two."""
     env = DummyVecEnv([lambda i=i: MemoryEnv(i) for i in range(ENVS)])
-    policy_kwargs = {"lstm_hidden_size": HIDDEN, "net_arch": [8]} | kwargs.pop("policy_kwargs", {})
+    policy_kwargs = {
+        "lstm_hidden_size": HIDDEN, "net_arch": [8], "optimizer_kwargs": {"fused": True},
+        **kwargs.pop("policy_kwargs", {}),
+    }  # fmt: skip
     defaults = {"n_epochs": 3, "learning_rate": 3e-3, "seed": 3, "device": "cpu"}
     return FastRecurrentPPO(
         policy,
@@ -80,7 +84,8 @@ def test_parameters_are_the_stock_policys():
     assert fast.state_dict().keys() == stock.state_dict().keys()
     assert all(th.equal(a, stock.state_dict()[n]) for n, a in fast.state_dict().items())
     groups = [p.optimizer.param_groups[0] for p in (fast, stock)]
-    assert groups[0]["eps"] == groups[1]["eps"] and groups[0]["lr"] == groups[1]["lr"]
+    assert groups[0]["eps"] == groups[1]["eps"] == 1e-8
+    assert groups[0]["lr"] == groups[1]["lr"]
 
 
 def test_outputs_and_gradients_on_rollouts():
@@ -220,6 +225,49 @@ def test_order_of_environments_is_drawn_from_numpys_generator():
     buffer.observations[:] = np.arange(ENVS)[:, None]
     assert order(0) == order(0) != order(1)
     assert order(0)[:ENVS] != order(0)[ENVS : 2 * ENVS]
+
+
+def test_only_the_actors_gradient_is_clipped():
+    """However large the critic's gradient is, the actor's is scaled to its own limit only."""
+    model = make_model(FastRecurrentPolicy, max_grad_norm=0.5)
+    actor = actor_parameters(model.policy)
+    critic = [p for p in model.policy.parameters() if all(p is not a for a in actor)]
+    assert len(actor) == 1 + 4 + 2 + 2 and len(critic) == 4 + 2 + 2
+
+    def norm(parameters: list[nn.Parameter]) -> float:
+        return float(th.cat([p.grad.flatten() for p in parameters]).norm())
+
+    for size, limited in ((1e-3, False), (0.1, True)):
+        for p in actor:
+            p.grad = th.full_like(p, size)
+        for p in critic:
+            p.grad = th.full_like(p, 100.0)
+        before = norm(actor)
+        assert (before > 0.5) == limited
+        model.policy.optimizer.step()
+        assert norm(actor) == pytest.approx(0.5 if limited else before, rel=1e-5)
+        assert all((p.grad == 100.0).all() for p in critic)
+
+
+def test_training_clips_nothing_else():
+    """SB3's own clipping of both networks' gradient at once is off."""
+    norms = []
+
+    def note(optimizer: th.optim.Optimizer, *_: object) -> None:
+        norms.append(
+            [
+                float(th.cat([p.grad.flatten() for p in part]).norm())
+                for part in (actor, [p for p in held if all(p is not a for a in actor)])
+            ]
+        )
+
+    model = make_model(FastRecurrentPolicy, max_grad_norm=0.05, vf_coef=1000.0)
+    held, actor = list(model.policy.parameters()), actor_parameters(model.policy)
+    model.policy.optimizer.register_step_pre_hook(note)
+    model.learn(ENVS * STEPS)
+    of_actor, of_critic = np.array(norms).T
+    np.testing.assert_allclose(of_actor, 0.05, rtol=1e-4)
+    assert of_critic.min() > 100.0
 
 
 def test_training_ends_at_the_same_weights():

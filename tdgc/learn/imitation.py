@@ -85,8 +85,7 @@ class ApprenticePolicy(TaughtPolicy):
     """A ``TaughtPolicy`` for imitation alone; its exploration noise is not trained."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        # Gradients of the actions' squared errors end up below SB3's eps of 1e-5.
-        super().__init__(*args, optimizer_kwargs={"eps": 1e-8, "fused": True}, **kwargs)
+        super().__init__(*args, **kwargs)
         self.log_std.requires_grad_(False)  # kept for the exploration afterwards
 
 
@@ -230,10 +229,8 @@ class Apprentice(FastRecurrentPPO):
                 imitation = policy.error(observations, mean).mean()
                 value_loss = nn.functional.mse_loss(values.flatten(), returns)
                 policy.optimizer.zero_grad()
-                imitation.backward()  # type: ignore[no-untyped-call]
-                # Clips only the actor's gradient: the critic shares no parameters, so has none yet.
-                nn.utils.clip_grad_norm_(policy.parameters(), self.max_grad_norm)
-                (self.vf_coef * value_loss).backward()  # type: ignore[no-untyped-call]
+                loss = imitation + self.vf_coef * value_loss
+                loss.backward()  # type: ignore[no-untyped-call]
                 policy.optimizer.step()
                 losses.append(imitation.item())
                 value_losses.append(value_loss.item())
