@@ -172,6 +172,8 @@ READ = (
     "python -m tdgc.benchmark.planted",
     "python -m tdgc.export --out runs/export",
     "python -m tdgc.mujoco --export runs/export --levels 6-10 --families all --episodes 20",
+    "python -m tdgc.mujoco --export runs/export --levels 6,8,10 --episodes 50",
+    "python evaluate.py --policies tdgc --levels 6,8,10 --episodes 50",
     "python train_high.py --no-teacher --low runs/low/policy --out runs/alone",
     "python -m tdgc.bench --load",
     "python -m tdgc.bench --update",
@@ -274,7 +276,23 @@ def test_commands_run(
         assert not left, f"{command} left no {', '.join(left)}"
 
 
-@pytest.mark.parametrize("command", READ)
+def inline_commands() -> list[str]:
+    """Commands with flags in the documents' sentences and tables; ``...`` stands for anything."""
+    found = set()
+    for text in TEXT.values():
+        prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+        for words in re.findall(r"`((?:python |evaluate\.py|train_\w+\.py)[^`]* --[^`]*)`", prose):
+            if "..." not in words:
+                found.add(words if words.startswith("python ") else f"python {words}")
+    return sorted(found)
+
+
+def test_documents_have_inline_commands() -> None:
+    assert "python train_high.py --preset paper" in inline_commands()
+    assert "python evaluate.py --conditions latency-30ms" in inline_commands()
+
+
+@pytest.mark.parametrize("command", [*READ, *inline_commands()])
 def test_flags_are_read(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class ReadError(Exception):
         """All flags were parsed."""

@@ -90,9 +90,9 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("cues", "a script that sees what the policy sees", policy="cues"),
     Variant("teacher", "the scripted teacher, which knows the tile", policy="teacher"),
 )
-#: Rows for trainings with a teacher, next to each other: without one, every robot is told its
-#: family.
-WITH_TEACHER = ("no-exchange", "no-teacher", "imitation")
+#: Rows for trainings with a teacher, next to each other: without one, robots are on the benchmark's
+#: families alone, and every robot is told its family.
+WITH_TEACHER = ("no-clutter", "no-exchange", "no-teacher", "imitation")
 #: Rows in their place with ``--no-teacher``: each undoes one setting that helps such a training.
 HELPS: tuple[Variant, ...] = (
     Variant("gait-per-decision", "noise of the gait not held", ("ppo.gait_hold=1",)),

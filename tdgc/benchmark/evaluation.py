@@ -85,7 +85,7 @@ CONDITIONS: dict[str, Condition] = {
     "motor-0.85": Condition("0.85 times the torque limits and gains of the joints", motor=0.85),
     "armature-0.01": Condition("rotor inertia of 0.01 kg m^2 per joint", armature=0.01),
     "latency-30ms": Condition("commands reach the joints 30 ms late", latency=0.03),
-    "physics-1000hz": Condition("physics at 1000 Hz", physics_hz=1000),
+    "physics-1000hz": Condition("physics and joint control at 1000 Hz", physics_hz=1000),
     "noise": Condition(
         "noise of the sensors as in training; the gait clock starts at random; height probes off "
         f"by up to {100 * _NOISE.noise_probes:g} cm and a decision late",
