@@ -227,25 +227,30 @@ def test_order_of_environments_is_drawn_from_numpys_generator():
     assert order(0)[:ENVS] != order(0)[ENVS : 2 * ENVS]
 
 
+def actor_and_critic(policy: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    actor = actor_parameters(policy)
+    return actor, [p for p in policy.parameters() if all(p is not a for a in actor)]
+
+
+def gradient_norm(parameters: list[nn.Parameter]) -> float:
+    return float(th.cat([p.grad.flatten() for p in parameters]).norm())
+
+
 def test_only_the_actors_gradient_is_clipped():
     """However large the critic's gradient is, the actor's is scaled to its own limit only."""
     model = make_model(FastRecurrentPolicy, max_grad_norm=0.5)
-    actor = actor_parameters(model.policy)
-    critic = [p for p in model.policy.parameters() if all(p is not a for a in actor)]
+    actor, critic = actor_and_critic(model.policy)
     assert len(actor) == 1 + 4 + 2 + 2 and len(critic) == 4 + 2 + 2
-
-    def norm(parameters: list[nn.Parameter]) -> float:
-        return float(th.cat([p.grad.flatten() for p in parameters]).norm())
 
     for size, limited in ((1e-3, False), (0.1, True)):
         for p in actor:
             p.grad = th.full_like(p, size)
         for p in critic:
             p.grad = th.full_like(p, 100.0)
-        before = norm(actor)
+        before = gradient_norm(actor)
         assert (before > 0.5) == limited
         model.policy.optimizer.step()
-        assert norm(actor) == pytest.approx(0.5 if limited else before, rel=1e-5)
+        assert gradient_norm(actor) == pytest.approx(0.5 if limited else before, rel=1e-5)
         assert all((p.grad == 100.0).all() for p in critic)
 
 
@@ -254,15 +259,10 @@ def test_training_clips_nothing_else():
     norms = []
 
     def note(optimizer: th.optim.Optimizer, *_: object) -> None:
-        norms.append(
-            [
-                float(th.cat([p.grad.flatten() for p in part]).norm())
-                for part in (actor, [p for p in held if all(p is not a for a in actor)])
-            ]
-        )
+        norms.append([gradient_norm(part) for part in parts])
 
     model = make_model(FastRecurrentPolicy, max_grad_norm=0.05, vf_coef=1000.0)
-    held, actor = list(model.policy.parameters()), actor_parameters(model.policy)
+    parts = actor_and_critic(model.policy)
     model.policy.optimizer.register_step_pre_hook(note)
     model.learn(ENVS * STEPS)
     of_actor, of_critic = np.array(norms).T

@@ -228,7 +228,8 @@ NO_TEACHER: tuple[str, ...] = (
     "ppo.learning_rate=5e-4",
     "ppo.memory_exchange=0",
     "env.unknown_share=0",
-    # As many robots on each family: most of the default's are on trenches, where they learn least.
+    # As many robots on each family: by default three in eight are among trenches, where they learn
+    # least.
     'env.families=["rough","pillar","stair","gap","tilt"]',
     # With feet at 0.08 m it reached 67 % of the goals on Stair, with feet as high as gp's, 98.5 %.
     "start_swing=0.19",

@@ -44,8 +44,8 @@ class MujocoConfig:
     # s, time constant of contacts and joint limits. At MuJoCo's default of 0.02 s feet sink 3-4 cm
     # into the ground, past their centres, and stay there.
     solref: Positive = 0.005
-    # Damping ratio of the same. At MuJoCo's default of 1 a foot that lands at 1 m/s leaves the
-    # ground again at 0.15 m/s; at 2, as in Bullet, it stays down.
+    # Damping ratio of the same. At MuJoCo's default of 1, feet that land at 1 m/s leave the
+    # ground again at 0.10 m/s; at 2 they stay down nearly as in Bullet, at 0.04 m/s.
     dampratio: Positive = 2.0
     # With pyramidal cones and MuJoCo's default impratio of 1, feet creep down slopes.
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
