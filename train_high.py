@@ -205,6 +205,7 @@ def make_learner(
         exchange = MemoryExchange(ppo.memory_exchange, untold_column(config.env))
     keywords = {
         "learning_rate": LinearRate(ppo.learning_rate, ppo.final_learning_rate),
+        "desired_kl": ppo.desired_kl,
         "batch_size": ppo.n_steps * config.n_envs // ppo.minibatches,
         **shared_keywords(ppo),
         **changed,

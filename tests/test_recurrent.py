@@ -16,6 +16,7 @@ from tdgc.learn.recurrent import (
     GaitNoise,
     MemoryExchange,
     actor_parameters,
+    adapted_share,
     exchange_memories,
     gait_entropy,
 )
@@ -148,7 +149,8 @@ def memories(robots: int) -> RNNStates:
 
 @pytest.mark.parametrize("untold", [None, 2])
 def test_memories_are_exchanged_among_robots_that_are_told_nothing(untold):
-    """Hidden states move as a whole, none is lost, and the expected number of them moves.
+    """The actor's hidden states move as a whole, none is lost, the expected number of them moves,
+    and the critic's stay.
 
     That is half of those taking part, less the robots that get their own back: one per shuffle on
     average.
@@ -163,8 +165,9 @@ def test_memories_are_exchanged_among_robots_that_are_told_nothing(untold):
         states = memories(robots)
         exchange_memories(states, seen, MemoryExchange(0.5, untold))
         owner = states.pi[0][0, :, 0]
-        for part, state in enumerate((*states.pi, *states.vf)):
+        for part, state in enumerate(states.pi):
             assert (state[0] == owner[:, None] + 0.25 * part).all()
+        assert all(map(th.equal, states.vf, memories(robots).vf))
         assert sorted(owner.tolist()) == list(range(robots))
         others = np.flatnonzero(owner.numpy() != np.arange(robots))
         assert np.isin(others, taking_part).all()
@@ -268,6 +271,27 @@ def test_training_clips_nothing_else():
     of_actor, of_critic = np.array(norms).T
     np.testing.assert_allclose(of_actor, 0.05, rtol=1e-4)
     assert of_critic.min() > 100.0
+
+
+@pytest.mark.parametrize(
+    ("share", "kl", "adapted"),
+    [
+        (0.3, 0.021, 0.2), (0.3, 0.019, 0.3), (0.3, 0.0051, 0.3), (0.3, 0.0049, 0.45),
+        (0.011, 0.5, 0.01), (0.9, 0.0, 1.0),
+    ],
+)  # fmt: skip
+def test_the_actors_share_of_the_learning_rate_follows_the_kl_divergence(share, kl, adapted):
+    assert adapted_share(share, kl, 0.01) == pytest.approx(adapted)
+
+
+@pytest.mark.parametrize(("desired", "share"), [(1e-9, 1.5**-2), (1e9, 1.0), (None, 1.0)])
+def test_only_the_actors_learning_rate_is_adapted(desired, share):
+    """The last of three updates is made at the share that the two before it left."""
+    model = make_model(FastRecurrentPolicy, learning_rate=3e-4, desired_kl=desired)
+    model.learn(3 * ENVS * STEPS)
+    actor, critic = (group["lr"] for group in model.policy.optimizer.param_groups)
+    assert actor == pytest.approx(share * 3e-4)
+    assert critic == 3e-4
 
 
 def test_training_ends_at_the_same_weights():

@@ -30,7 +30,7 @@ from tdgc.files import write_synced
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and the one before in case that is damaged
-_VERSION = 15  # to be raised when the state of a run changes: other versions are refused
+_VERSION = 16  # to be raised when the state of a run changes: other versions are refused
 #: Tensor names of the recurrent learner's LSTM states in the current episodes.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 

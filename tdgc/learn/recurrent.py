@@ -266,7 +266,9 @@ def gait_entropy(mean: th.Tensor, std: th.Tensor, limit: float, gaits: int) -> t
 def exchange_memories(
     states: RNNStates, seen: NDArray[np.float32], exchange: MemoryExchange
 ) -> None:
-    """Shuffle the hidden states of a random subset of the robots among them, in place.
+    """Shuffle the actor's hidden states of a random subset of the robots among them, in place.
+
+    The critic keeps its own: it is to value what the robot will meet.
 
     Args:
         states: of actor and critic, each (1, M, hidden).
@@ -278,7 +280,7 @@ def exchange_memories(
         untold = np.flatnonzero(seen[:, exchange.untold] > 0.5)
     some = untold[np.random.random(len(untold)) < exchange.share]
     others = np.random.permutation(some)
-    for state in (*states.pi, *states.vf):
+    for state in states.pi:
         state[:, some] = state[:, others]
 
 
@@ -349,6 +351,19 @@ def actor_parameters(policy: nn.Module) -> list[nn.Parameter]:
     return [p for name, p in policy.named_parameters() if not name.startswith(critic)]
 
 
+def adapted_share(share: float, kl: float, desired: float) -> float:
+    """The actor's share of the learning rate, from 0.01 to 1, after an update that changed the
+    policy by a KL divergence ``kl``.
+
+    Rule and factor are those by which rsl_rl adapts its learning rate to each minibatch.
+    """
+    if kl > 2.0 * desired:
+        share /= 1.5
+    elif kl < desired / 2.0:
+        share *= 1.5
+    return min(max(share, 0.01), 1.0)
+
+
 class FastRecurrentPPO(RecurrentPPO):
     """``RecurrentPPO`` with ``WholeEnvBuffer``, which clips the gradient of the actor alone.
 
@@ -361,6 +376,10 @@ class FastRecurrentPPO(RecurrentPPO):
         gait_ent_coef: weight of the gaits' entropy (``GaitNoise``) in the loss at the first step;
             it falls linearly to zero at the last. It requires an ``ent_coef`` above 0.
         exchange: exchange of hidden states after each rollout; None for no exchange.
+        desired_kl: KL divergence of the policy after an update from that before; the actor's
+            learning rate is a share of ``learning_rate`` that keeps it at or below this, see
+            ``adapted_share``. None: the actor learns at ``learning_rate``, as the critic always
+            does.
 
     Raises:
         ValueError: ``batch_size`` is below ``n_steps``, too small for one environment's rollout.
@@ -371,9 +390,10 @@ class FastRecurrentPPO(RecurrentPPO):
         *args: Any,
         gait_ent_coef: float = 0.0,
         exchange: MemoryExchange | None = None,
+        desired_kl: float | None = None,
         **kwargs: Any,
     ) -> None:
-        self.gait_ent_coef, self.exchange = gait_ent_coef, exchange
+        self.gait_ent_coef, self.exchange, self.desired_kl = gait_ent_coef, exchange, desired_kl
         super().__init__(*args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
@@ -391,10 +411,29 @@ class FastRecurrentPPO(RecurrentPPO):
             bonus = self.gait_ent_coef * self._current_progress_remaining / self.ent_coef
             cast(FastRecurrentPolicy, self.policy).gait_bonus = bonus
         super().train()
+        if self.desired_kl is not None:
+            kl = float(self.logger.name_to_value["train/approx_kl"])
+            share = cast(th.Tensor, self.policy.actor_share)
+            share.fill_(adapted_share(float(share), kl, self.desired_kl))
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        super()._update_learning_rate(optimizers)
+        if self.desired_kl is not None:
+            actor = self.policy.optimizer.param_groups[0]
+            actor["lr"] *= float(cast(th.Tensor, self.policy.actor_share))
+            self.logger.record("train/actor_learning_rate", actor["lr"])
 
     def _setup_model(self) -> None:
         super()._setup_model()
         actor = actor_parameters(self.policy)
+        critic = [p for p in self.policy.parameters() if all(p is not a for a in actor)]
+        self.policy.optimizer = self.policy.optimizer_class(
+            [{"params": actor}, {"params": critic}],
+            lr=self.lr_schedule(1.0),  # type: ignore[call-arg]  # as in SB3
+            **self.policy.optimizer_kwargs,
+        )
+        if self.desired_kl is not None:  # as a buffer it is part of a checkpoint
+            self.policy.register_buffer("actor_share", th.ones((), device=self.device))
         limit, self.max_grad_norm = self.max_grad_norm, math.inf
 
         def clip(*_: Any) -> None:
