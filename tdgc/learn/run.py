@@ -334,7 +334,7 @@ class RunCallback(BaseCallback):
             values["episode/length"] = float(np.mean([e["l"] for e in episodes]))
         for name in (
             "imitation_loss", "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction",
-            "std", "learning_rate",
+            "std", "learning_rate", "actor_learning_rate",
         ):  # fmt: skip
             number = self.logger.name_to_value.get(f"train/{name}")
             if number is not None:
