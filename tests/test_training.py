@@ -514,7 +514,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
         "--set", "ppo.lstm=8",
         "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]", "--set", "env.episode_seconds=0.7",
         "--set", "imitation.steps=16", "--set", "imitation.levels_after=hardest",
-        "--set", "imitation.kept=2",
+        "--set", "imitation.kept=2", "--set", "ppo.desired_kl=1e-9",
         "--set", 'env.families=["rough","pillar"]',
     ]  # fmt: skip
     monkeypatch.chdir(ROOT)  # where ``kill_run`` starts the resumed run
@@ -535,6 +535,9 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     # steps and at the end.
     rates = [row["train/learning_rate"] for row in rows(whole)]
     assert rates == pytest.approx([1.1e-3, 5e-5 + 0.4 * 1e-4, 5e-5])
+    # The actor's is lowered by a third after each update of reinforcement learning.
+    rates = [row["train/actor_learning_rate"] for row in rows(whole)]
+    assert rates == pytest.approx([1.1e-3, 5e-5 + 0.4 * 1e-4, 5e-5 / 1.5**2], rel=1e-4)
     last = broken / "checkpoints/step-000000000024"
     with monkeypatch.context() as patch:
         at_calls(patch, lambda call, run: setattr(run, "reason", "a test" if call == 2 else None))
