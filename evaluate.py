@@ -28,9 +28,12 @@ from tdgc.benchmark.flags import add_arguments, choose, resolve
 from tdgc.benchmark.recording import Recorder, Recording
 from tdgc.benchmark.results import (
     EDITIONS,
+    ROBOT,
+    Training,
     describe,
     editions_of,
     make_room,
+    robot_changes,
     salvage,
     write_results,
 )
@@ -352,7 +355,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     Raises:
         BaseException: what stopped it; the table of the complete cells is written first.
     """
-    e, out, trained_on = evaluation, evaluation.out, editions(low, drivers)
+    e, out, trained_on = evaluation, evaluation.out, training(low, drivers)
     cells = plan(list(drivers), e.conditions, e.families, e.levels, e.episodes)
     work = functools.partial(
         run_one, low=low, drivers=drivers, seed=e.seed, filmed=e.filmed, traced=e.traced
@@ -395,13 +398,13 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     return problems
 
 
-def editions(low: Policy, drivers: Mapping[str, Driver]) -> dict[str, int]:
-    """Editions of the benchmark that the policies were trained on, see ``editions_of``."""
+def training(low: Policy, drivers: Mapping[str, Driver]) -> Training:
+    """What the policies were trained on."""
     used = {"low": low.meta}
     pair = drivers.get("tdgc")
     if isinstance(pair, HierarchyDriver) and isinstance(pair.high, Policy):
         used["high"] = pair.high.meta
-    return editions_of(used)
+    return Training(editions_of(used), robot_changes(mdp_of(low)))
 
 
 def print_effect(effect: dict[str, Any]) -> None:
@@ -422,7 +425,9 @@ def run_tracking(evaluation: Evaluation, low: Policy) -> None:
     """Measure the low policy alone, print the results and write tracking.json."""
     e = evaluation
     result = tracking(low, e.episodes, e.seed, e.workers, e.run_jobs)
-    write_json(e.out / "tracking.json", result | {EDITIONS: editions(low, {})})
+    trained_on = training(low, {})
+    about = {EDITIONS: trained_on.editions, ROBOT: trained_on.robot}
+    write_json(e.out / "tracking.json", result | about)
     print("gait    velocity RMSE  yaw rate RMSE  contact match")
     for gait, r in result["gaits"].items():
         print(
@@ -430,6 +435,8 @@ def run_tracking(evaluation: Evaluation, low: Policy) -> None:
             f"{100 * r['contact_match']:13.1f} %"
         )
     print(f"{result['falls_per_10_min']:.2f} falls in 10 minutes ({result['minutes']:.1f} walked)")
+    for text in trained_on.robot:
+        print(f"not the benchmark's robot: {text}")
 
 
 def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> None:

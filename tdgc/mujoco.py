@@ -21,7 +21,14 @@ from tdgc.benchmark import flags
 from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import Batch, Cell, Episode, Watcher, closed_loop, plan
 from tdgc.benchmark.recording import Recorder, Recording
-from tdgc.benchmark.results import describe, editions_of, make_room, salvage, write_results
+from tdgc.benchmark.results import (
+    Training,
+    describe,
+    editions_of,
+    make_room,
+    salvage,
+    write_results,
+)
 from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
@@ -178,9 +185,8 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
         logged=args.log,
     )
     controller = load(args.export)
-    trained_on = editions_of(
-        {"low": controller.low.table["policy"], "high": controller.high.table["policy"]}
-    )
+    tables = {"low": controller.low.table["policy"], "high": controller.high.table["policy"]}
+    trained_on = Training(editions_of(tables))
     episodes: list[Episode] = []
     recordings: list[Recording] = []
     with salvage(args.out, episodes, cells, trained_on) as bar:

@@ -18,7 +18,7 @@ from PIL import Image
 
 from tdgc.benchmark.diagnosis import Diagnosis
 from tdgc.benchmark.evaluation import CONDITIONS, Episode
-from tdgc.benchmark.results import write_results
+from tdgc.benchmark.results import Training, write_results
 from tdgc.show import report
 
 EVIL = "<script>alert('x')"  # a policy's name
@@ -175,7 +175,8 @@ def test_mirrored_tiles_and_other_editions(tmp_path: Path) -> None:
         )
         for k in range(count)
     ]  # fmt: skip
-    summary = write_results(tmp_path, episodes, {"low": 1, "high": 2})
+    training = Training({"low": 1, "high": 2}, ["robot.kp=18.6, not 20.0", "robot.kd=0.5, not 0.6"])
+    summary = write_results(tmp_path, episodes, training)
     for name, _, _ in report.FIGURES:
         write_picture(tmp_path / name)
     reader = Reader(report.render(tmp_path))
@@ -189,10 +190,12 @@ def test_mirrored_tiles_and_other_editions(tmp_path: Path) -> None:
         "The low policy was trained on edition 1 of TDGC-Bench, these tiles are of edition 2."
         in reader.text
     )
+    text = "Not the benchmark's robot: robot.kp=18.6, not 20.0; robot.kd=0.5, not 0.6."
+    assert text in reader.text
     assert "The high policy" not in reader.text and "episodes: 22; edition 2; tdgc" in reader.text
     write_results(tmp_path, episodes[:10])
     text = Reader(report.render(tmp_path)).text
-    assert "mirrored" not in text and "edition" not in text
+    assert "mirrored" not in text and "edition" not in text and "benchmark's robot" not in text
 
 
 def test_only_height_maps_may_have_been_trained_on(tmp_path: Path) -> None:

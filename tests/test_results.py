@@ -11,7 +11,18 @@ import pytest
 
 from tdgc.benchmark.evaluation import Episode
 from tdgc.benchmark.intervals import paired_interval
-from tdgc.benchmark.results import FILES, compare, describe, make_room, summarise, write_results
+from tdgc.benchmark.results import (
+    FILES,
+    Training,
+    compare,
+    describe,
+    make_room,
+    policies_of,
+    robot_changes,
+    summarise,
+    write_results,
+)
+from tdgc.config import LowLevelConfig
 
 
 def row(policy: str, family: str, level: int, episode: int, outcome: str) -> Episode:
@@ -103,13 +114,30 @@ def test_mirror_images_are_compared_with_their_tiles(tmp_path: Path) -> None:
 
 
 def test_the_table_says_which_edition_a_policy_was_trained_on(tmp_path: Path) -> None:
-    found = describe(write_results(tmp_path, EPISODES, {"low": 1, "high": 2}))
+    found = describe(write_results(tmp_path, EPISODES, Training({"low": 1, "high": 2})))
     assert found.endswith(
         "the low policy was trained on edition 1 of TDGC-Bench, these tiles are of edition 2"
     )
     assert "the high policy" not in found
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["editions"] == {"tiles": 2, "low": 1, "high": 2}
+
+
+def test_the_table_says_what_differs_from_the_benchmarks_robot(tmp_path: Path) -> None:
+    """Its motors, gains and physics are named; what belongs to the low policy is not."""
+    config = LowLevelConfig()
+    assert robot_changes(config) == []
+    robot = dataclasses.replace(config.robot, kp=18.6, action_scale=0.5, joint_margin=None)
+    physics = dataclasses.replace(config.physics, control_dt=0.01)
+    changes = robot_changes(dataclasses.replace(config, robot=robot, physics=physics))
+    assert changes == ["robot.kp=18.6, not 20.0", "physics.control_dt=0.01, not 0.02"]
+    summary = write_results(tmp_path, EPISODES, Training({"low": 2, "high": 2}, changes))
+    assert summary["robot"] == changes and list(policies_of(summary)) == ["tdgc", "gp"]
+    assert describe(summary).splitlines()[-4:] == [
+        "", "not the benchmark's robot:", f"  {changes[0]}", f"  {changes[1]}",
+    ]  # fmt: skip
+    usual = write_results(tmp_path, EPISODES, Training({"low": 2, "high": 2}))
+    assert "robot" not in usual and "robot" not in describe(usual)
 
 
 def test_policies_on_other_tiles_are_not_compared(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -13,6 +14,7 @@ from tqdm import tqdm
 
 from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
+from tdgc.config import LowLevelConfig, differences, to_dict
 from tdgc.errors import InputError
 from tdgc.files import atomic, make_folder, write_json
 from tdgc.sim.terrain import EDITION
@@ -20,14 +22,29 @@ from tdgc.sim.terrain import EDITION
 #: Files written by ``write_results``.
 FILES = ("episodes.csv", "summary.json", "trajectories.npz")
 _FILMS = ("films/film_*", "films/sheet_*", "films/strip_*")
-#: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; and
-#: the benchmark editions of the tiles and of the policies' training.
-PAIRED, SIDES, EDITIONS = "paired", "sides", "editions"
+#: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; the
+#: benchmark editions of the tiles and of the policies' training; and ``Training.robot``.
+PAIRED, SIDES, EDITIONS, ROBOT = "paired", "sides", "editions", "robot"
+# Settings of a robot that the benchmark prescribes; the others belong to the low policy.
+_PRESCRIBED = ("urdf", "kp", "kd", "torque_limit", "speed_limit", "base_height")
 # The rule of dominance (TDGC-Bench): ``tdgc`` is nowhere significantly below ``gp``. Its lead over
 # ``cues`` is what learning adds to the cues.
 _PAIRS = (("tdgc", "gp"), ("tdgc", "cues"))
 
 _Where = tuple[str, str, int, int]  # policy or condition, family, level, episode
+
+
+@dataclass(frozen=True)
+class Training:
+    """What the policies of an evaluation were trained on.
+
+    Attributes:
+        editions: of the benchmark, keyed by "low" and "high", see ``editions_of``.
+        robot: what differs from the benchmark's robot and physics, see ``robot_changes``.
+    """
+
+    editions: Mapping[str, int]
+    robot: Sequence[str] = ()
 
 
 def make_room(out: Path, patterns: Sequence[str], folders: Mapping[str, bool]) -> None:
@@ -126,7 +143,8 @@ def describe(summary: dict[str, Any]) -> str:
 
     It lists the rates by family and level with their means, the paired differences in points of
     success with a note where the first policy is below the second, the differences on mirrored
-    tiles, and policies that were trained on another edition of the benchmark.
+    tiles, policies that were trained on another edition of the benchmark, and what differs from the
+    benchmark's robot.
     """
     lines: list[str] = []
     for policy, conditions in policies_of(summary).items():
@@ -144,6 +162,8 @@ def describe(summary: dict[str, Any]) -> str:
                 f"the {name} policy was trained on edition {edition} of TDGC-Bench, these tiles "
                 f"are of edition {EDITION}",
             ]
+    if ROBOT in summary:
+        lines += ["", "not the benchmark's robot:", *(f"  {text}" for text in summary[ROBOT])]
     return "\n".join(lines)
 
 
@@ -162,9 +182,25 @@ def editions_of(metas: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
     return found
 
 
+def robot_changes(mdp: LowLevelConfig) -> list[str]:
+    """List what a low policy's ``mdp`` has in place of the benchmark's robot, motors and physics,
+    such as ``robot.kp=18.6, not 20.0``."""
+
+    def prescribed(config: LowLevelConfig) -> dict[str, Any]:
+        tables = to_dict(config)
+        return {
+            "robot": {name: tables["robot"][name] for name in _PRESCRIBED},
+            "physics": tables["physics"],
+        }
+
+    found, usual = prescribed(mdp), prescribed(LowLevelConfig())
+    return [text for name in found for text in differences(found[name], usual[name], name)]
+
+
 def policies_of(summary: dict[str, Any]) -> dict[str, Any]:
     """Return the rates by policy from a ``summary``, without its other keys."""
-    return {key: value for key, value in summary.items() if key not in (PAIRED, SIDES, EDITIONS)}
+    others = (PAIRED, SIDES, EDITIONS, ROBOT)
+    return {key: value for key, value in summary.items() if key not in others}
 
 
 def verdict(pair: str, found: dict[str, float]) -> str:
@@ -198,12 +234,11 @@ def _rates(families: dict[str, Any]) -> list[str]:
 
 
 def write_results(
-    folder: Path, episodes: Sequence[Episode], editions: Mapping[str, int] | None = None
+    folder: Path, episodes: Sequence[Episode], training: Training | None = None
 ) -> dict[str, Any]:
     """Write episodes.csv, summary.json and trajectories.npz into ``folder``; return the summary.
 
-    ``editions`` are the benchmark editions that the policies were trained on, keyed by "low" and
-    "high". Policies that were not run on the same tiles are not compared.
+    Policies that were not run on the same tiles are not compared.
 
     trajectories.npz holds the tracks in the order of episodes.csv: ``poses`` (N, 3) of all episodes
     one after another, ``counts`` (E,), the number of poses of each episode, and ``goals`` (E, 2).
@@ -234,8 +269,10 @@ def write_results(
         summary[PAIRED] = {" - ".join(pair): compare(episodes, *pair) for pair in pairs}
     if found := sides(episodes):
         summary[SIDES] = found
-    if editions:
-        summary[EDITIONS] = {"tiles": EDITION, **editions}
+    if training is not None:
+        summary[EDITIONS] = {"tiles": EDITION, **training.editions}
+        if training.robot:
+            summary[ROBOT] = list(training.robot)
     write_json(folder / "summary.json", summary)
     return summary
 
@@ -248,7 +285,7 @@ def salvage(
     folder: Path,
     episodes: Sequence[Episode],
     cells: Sequence[Cell],
-    editions: Mapping[str, int] | None = None,
+    training: Training | None = None,
 ) -> Iterator[tqdm]:
     """Progress bar for running episodes that keeps what is ``complete`` whatever stops them;
     SIGTERM does so as Ctrl-C does, with a KeyboardInterrupt.
@@ -257,7 +294,7 @@ def salvage(
     exception, and re-raises it.
 
     Args:
-        folder, editions: as for ``write_results``.
+        folder, training: as for ``write_results``.
         episodes: the episodes that have ended; the caller appends to it meanwhile.
         cells: all batches of the evaluation.
     """
@@ -269,7 +306,7 @@ def salvage(
     except (Exception, KeyboardInterrupt) as error:
         done = complete(episodes, cells)
         if done:
-            print(describe(write_results(folder, done, editions)))
+            print(describe(write_results(folder, done, training)))
             error.add_note(f"the table has {len(done)} of {total} episodes")
         else:
             error.add_note(f"no table, as 0 of {total} episodes are of complete cells")

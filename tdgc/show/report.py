@@ -19,7 +19,7 @@ import jinja2
 import tdgc
 from tdgc.benchmark.diagnosis import LAYERS, count_failures
 from tdgc.benchmark.evaluation import CONDITIONS, EpisodeRecord
-from tdgc.benchmark.results import EDITIONS, PAIRED, SIDES, policies_of, verdict
+from tdgc.benchmark.results import EDITIONS, PAIRED, ROBOT, SIDES, policies_of, verdict
 from tdgc.files import write_text
 from tdgc.sim.terrain import is_map
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
@@ -223,6 +223,7 @@ def render(folder: Path) -> str:
         seeds=_distinct(episodes, "seed"),
         count=len(episodes),
         editions=written.get(EDITIONS, {}),
+        robot=written.get(ROBOT, []),
         summary=policies_of(written),
         differences=_differences(written),
         verdict=verdict,
