@@ -8,9 +8,10 @@ import pytest
 
 from tdgc.config import PhysicsConfig, RobotConfig
 from tdgc.sim.bullet_world import BulletWorld
+from tdgc.sim.geometry import read_geometry
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
-from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
-from tdgc.sim.rotors import excess_momentum
+from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
+from tdgc.sim.rotors import excess_momentum, force_on_calf
 from tdgc.sim.terrain import TileField
 from tdgc.sim.urdf import urdf_path
 
@@ -127,6 +128,40 @@ def test_inertia_is_added_to_a_joints_link_and_its_parent() -> None:
     np.testing.assert_allclose(inertia(), before, atol=1e-9)
     assert not world.state.rotor_excess.any()
     world.close()
+
+
+def test_force_on_a_calf_has_the_given_torques() -> None:
+    rng, geometry = np.random.default_rng(0), read_geometry(ROBOT)
+    q = NOMINAL + rng.uniform(-0.3, 0.3, 12)
+    feet, _ = foot_kinematics(geometry, q[None], np.zeros((1, 12)))
+    for leg in range(4):
+        joints, force = slice(3 * leg, 3 * leg + 3), rng.normal(size=3)
+        _, moved = foot_kinematics(geometry, np.tile(q, (3, 1)), np.eye(12)[joints])
+        torque = moved[:, leg] @ force
+        found = force_on_calf(geometry, leg, q[joints], feet[0, leg], torque)
+        np.testing.assert_allclose(found, force)
+
+
+@pytest.mark.parametrize("armature", [0.0, 0.005, ROTOR, 0.015])
+def test_feet_that_hit_a_wall_stay_there(armature: float) -> None:
+    """A robot whose nose points down swings its front feet into the plane, at 2.2 m/s."""
+    world = bullet(PhysicsConfig(control_dt=0.005, substeps=2), armature)
+    world.strength[:] = 0.0
+    q, speed = NOMINAL.copy(), np.zeros(12)
+    q[1:6:3], speed[1:6:3] = 0.3, -1.0  # feet ahead of the trunk, swinging forward
+    geometry = world.state.geometry
+    (feet,), (moving,) = foot_kinematics(geometry, q[None], speed[None])
+    height = feet[0, 0] + geometry.foot_radius + 0.02
+    down = np.array([[0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)]])
+    world.reset_robots([0], np.array([[0.0, 0.0, height]]), down, q[None])
+    world.state.qd[0] = speed * 2.2 / moving[0, 0]
+    world._put(0)
+    speeds = []
+    for _ in range(10):
+        world.step(np.tile(q, (3, 1, 1)), np.zeros(1), np.zeros((1, 12)))
+        speeds.append(world.state.foot_velocity[0, :2, 2].mean())
+    world.close()
+    assert min(speeds) < -2.0 and max(speeds) < 0.25, speeds
 
 
 def test_principal_axes_may_be_turned(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from tdgc.sim.robot import (
     quaternion_product,
     rotation_matrix,
 )
-from tdgc.sim.rotors import excess_momentum
+from tdgc.sim.rotors import excess_momentum, force_on_calf
 from tdgc.sim.terrain import CELL, HEIGHT_RANGE, TILE_SAMPLES, TileField
 from tdgc.sim.urdf import JOINTS, merged_file, read_urdf, urdf_path
 from tdgc.sim.world import World
@@ -37,6 +37,11 @@ _GROUND, _ROBOT = 1, 2  # collision groups: robots collide with the ground only
 _TRUNK = -1  # Bullet's index of a body's root link
 _PARKED = 50.0  # m, lift that clears all terrain, which stays within HEIGHT_RANGE
 _SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out
+_TOUCHES = 0.0005  # m: a calf this close to the ground is in contact, even if it does not press
+#: rad/s^2: a leg in contact is not held against what rotors give back if that is less than this
+#: times J. Then feet that meet a riser at less than 0.4 m/s bounce back; half of it would halve
+#: that speed, but twice as many legs would be looked up.
+_FELT = 500.0
 _FOOT_REACH = 0.03  # m beyond the foot's radius: nearer calf contacts are the foot's
 
 
@@ -382,6 +387,8 @@ class BulletWorld(World):
                     pybullet.applyExternalTorque(
                         body, _TRUNK, turn, pybullet.WORLD_FRAME, physicsClientId=client.id
                     )
+                for held in self._held(client, bodies, armature, rotation, q, excess):
+                    pybullet.applyExternalForce(*held, pybullet.WORLD_FRAME, client.id)
             started = time.perf_counter()
             client.stepSimulation()
             self.bullet_seconds += time.perf_counter() - started
@@ -412,6 +419,35 @@ class BulletWorld(World):
         ang_vel = np.array([pybullet.getBaseVelocity(body, client.id)[1] for body in bodies])
         rotation = rotation_matrix(np.array(turned)) @ self._to_axes
         return rotation, *excess_momentum((ang_vel[:, None] @ rotation)[:, 0], q, qd)
+
+    def _held(
+        self,
+        client: _Client,
+        bodies: list[int],
+        armature: Array,
+        rotation: Array,
+        q: Array,
+        excess: Array,
+    ) -> Iterator[tuple[int, int, list[float], tuple[float, ...]]]:
+        """Forces that keep the calves of ``bodies`` (n,) where they touch the ground, against
+        ``excess`` (n, 15) where it would lift them: body, link, force and point in the world."""
+        torque = excess[:, :NUM_JOINTS].reshape(-1, 4, 3)
+        large = (np.abs(torque) > _FELT * armature[:, None, None]).any(axis=2)
+        for k, leg in np.argwhere(large).tolist():
+            body, link, turn = bodies[k], self._joints[3 * leg + 2], rotation[k]
+            # One call per leg: they are few, and reading all contacts takes longer.
+            for contact in pybullet.getContactPoints(client.ground, body, -1, link, client.id):
+                if contact[9] <= 0.0 and contact[8] > _TOUCHES:
+                    continue
+                centre, _ = pybullet.getBasePositionAndOrientation(body, client.id)
+                point, (nx, ny, nz) = contact[6:8]  # on the calf; the normal, into the ground
+                place = np.subtract(point, centre) @ turn + self._centre
+                angles = q[k, 3 * leg : 3 * leg + 3]
+                force = force_on_calf(self.state.geometry, leg, angles, place, torque[k, leg])
+                fx, fy, fz = (turn @ force).tolist()
+                if fx * nx + fy * ny + fz * nz < 0.0:
+                    yield body, link, [-fx, -fy, -fz], point
+                    break
 
     def _force(self, contact: tuple[Any, ...]) -> float:
         """Normal force of a contact in N.

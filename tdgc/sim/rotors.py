@@ -10,12 +10,23 @@ takes follow from Lagrange's equations, and are given back a joint control later
 That is a Jacobi iteration of the equations of motion. With J in both links it converges for any J;
 in the moved link alone it would not, where the trunk is light.
 
+A contact is part of these equations, but Bullet solves it once, with too much inertia: it stops
+J in both links of a joint, and what is given back a joint control later would throw the foot off
+again. The contact should have pushed less, by the force that has the same torques about the leg's
+joints as what is given back. So that force is taken from the contact afterwards, with
+``force_on_calf``. Where the contact persists, as in stance, this changes no motion: the ground
+pushes that much more.
+
 Bullet keeps a link's inertia about its principal axes, so J goes to the one nearest to the joint's
 axis. That is exact where they coincide, as in the shipped robot, and wrong where they are tilted.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+
+from tdgc.sim.geometry import Geometry
 
 Array = NDArray[np.float64]
 
@@ -52,3 +63,42 @@ def excess_momentum(body_rate: Array, q: Array, qd: Array) -> tuple[Array, Array
     a, b, c = body_rate.T
     force[:, 12], force[:, 13], force[:, 14] = b * z - c * y, c * x - a * z, a * y - b * x
     return momentum, force
+
+
+_SHORTEST = 0.1  # of the thigh's length: levers shorter than that are taken to be as long
+
+
+def force_on_calf(
+    geometry: Geometry, leg: int, angles: Array, point: Array, torque: Array
+) -> Array:
+    """Force on a calf that has given torques about the joints of its leg.
+
+    Where a leg is nearly straight or level, that would take a very large force; then a smaller one
+    is returned.
+
+    Args:
+        geometry: the robot's geometry.
+        leg: 0-3.
+        angles: (3,) rad, of hip, thigh and calf.
+        point: (3,) m in the trunk's frame, where the force acts.
+        torque: (3,) N m, about hip, thigh and calf.
+
+    Returns:
+        (3,) N in the trunk's frame.
+    """
+    (hip, thigh, _), (x, y, z), (about_hip, about_thigh, about_calf) = (
+        part.tolist() for part in (angles, point, torque)
+    )
+    cos, sin = math.cos(hip), math.sin(hip)
+    # The point from the hip joint, in a frame that turns with the hip, and from the calf joint.
+    x, y = x - float(geometry.hips[leg, 0]), y - float(geometry.hips[leg, 1])
+    left, down = cos * y + sin * z, sin * y - cos * z
+    calf_x = x + geometry.thigh * math.sin(thigh)
+    calf_down = down - geometry.thigh * math.cos(thigh)
+    shortest = _SHORTEST * geometry.thigh
+    area = down * calf_x - x * calf_down
+    area = math.copysign(max(abs(area), shortest * geometry.calf), area)
+    forward = (x * about_calf - calf_x * about_thigh) / area
+    downward = (down * about_calf - calf_down * about_thigh) / area
+    leftward = (about_hip + left * downward) / math.copysign(max(abs(down), shortest), down)
+    return np.array([forward, cos * leftward + sin * downward, sin * leftward - cos * downward])
