@@ -34,7 +34,7 @@ from tdgc.config import (
 from tdgc.errors import script
 from tdgc.files import checksum, make_folder
 from tdgc.learn.flags import Machine, add_arguments, configure
-from tdgc.learn.imitation import Apprentice, ApprenticePolicy, TaughtPolicy
+from tdgc.learn.imitation import Apprentice, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, check_batch, shared_keywords
 from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, MemoryExchange
 from tdgc.learn.run import Interruption, Phase, Run
@@ -243,7 +243,7 @@ def build_imitation(
     shown = dataclasses.replace(config, env=mdp)
     env = make_env(shown, low, True, led, machine)
     model = make_learner(
-        Apprentice, ApprenticePolicy, env, config, machine.device,
+        Apprentice, TaughtPolicy, env, config, machine.device,
         learning_rate=LinearRate(imitation.learning_rate, imitation.final_learning_rate),
         n_epochs=imitation.n_epochs,
         kept=imitation.kept,

@@ -12,14 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from tdgc import policies
-from tdgc.learn.imitation import (
-    Apprentice,
-    ApprenticePolicy,
-    Notebook,
-    TaughtPolicy,
-    expected_price,
-    imitation_loss,
-)
+from tdgc.learn.imitation import Apprentice, Notebook, TaughtPolicy, expected_price, imitation_loss
 from tdgc.learn.recurrent import FastRecurrentPPO, WholeEnvBuffer
 from tdgc.sim.commands import INDEX, NUM_ACTIONS
 from tdgc.tasks.high_observation import GUIDANCE
@@ -74,7 +67,7 @@ def learner(
 
 @pytest.fixture
 def apprentice() -> FastRecurrentPPO:
-    return learner(Apprentice, ApprenticePolicy)
+    return learner(Apprentice, TaughtPolicy)
 
 
 def error(model: FastRecurrentPPO) -> float:
@@ -155,7 +148,7 @@ def test_what_is_kept_is_not_forgotten() -> None:
     """
     left = {}
     for kept in (1, 20):
-        model = learner(Apprentice, ApprenticePolicy, kept=kept)
+        model = learner(Apprentice, TaughtPolicy, kept=kept)
         model.learn(1)
         rng, rollout = np.random.default_rng(0), model.rollout_buffer
         lessons = []

@@ -81,14 +81,6 @@ class TaughtPolicy(FastRecurrentPolicy):
         return super().unroll(obs[..., : self.seen], *args)
 
 
-class ApprenticePolicy(TaughtPolicy):
-    """A ``TaughtPolicy`` for imitation alone; its exploration noise is not trained."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.log_std.requires_grad_(False)  # kept for the exploration afterwards
-
-
 def expected_price(stride: th.Tensor, price: th.Tensor, limit: float) -> th.Tensor:
     """Smoothed price of strides, (n,).
 
@@ -201,6 +193,8 @@ class Notebook:
 class Apprentice(FastRecurrentPPO):
     """``FastRecurrentPPO`` that imitates the teacher instead of improving its actions.
 
+    Its loss does not depend on the exploration noise, which is kept for the exploration afterwards.
+
     Args:
         kept: number of newest rollouts that it learns from.
     """
@@ -211,7 +205,7 @@ class Apprentice(FastRecurrentPPO):
 
     def train(self) -> None:
         """Make one update on ``imitation_loss`` and the critic's squared error."""
-        policy = cast(ApprenticePolicy, self.policy)
+        policy = cast(TaughtPolicy, self.policy)
         policy.set_training_mode(True)
         self._update_learning_rate(policy.optimizer)
         rollout = cast(WholeEnvBuffer, self.rollout_buffer)

@@ -74,7 +74,8 @@ class MemoryExchange:
 
 
 class FastRecurrentPolicy(RecurrentActorCriticPolicy):
-    """``MlpLstmPolicy`` with a fast ``evaluate_actions``; for ``FastRecurrentPPO``.
+    """``MlpLstmPolicy`` with a fast ``evaluate_actions``; for ``FastRecurrentPPO``, which also
+    makes its optimiser.
 
     It takes the same arguments, has the same parameters and computes the same numbers. With a
     ``mirror``, the policy and its value are exactly left-right symmetric. If ``lstm_hidden_size``
@@ -126,16 +127,11 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
                 self._memory(lstm_hidden_size) for _ in range(2)
             )
             self.lstm_hidden_state_shape = (1, 1, self.lstm_actor.hidden_size)
-            self.optimizer = self.optimizer_class(
-                self.parameters(),
-                lr=lr_schedule(1),  # type: ignore[call-arg]  # as in SB3
-                **self.optimizer_kwargs,
-            )
         if gait is not None and gait.hold > 1:
             # The held noise and its age in decisions; as a buffer it is part of a checkpoint.
             self.held: th.Tensor
             self.register_buffer("held", th.zeros(2, gait.robots))
-        if mirror is not None:  # parameters stay the same, so the optimiser remains valid
+        if mirror is not None:
             self.lstm_actor = MirroredLSTM(self.lstm_actor, mirror)  # type: ignore[assignment]
             critic = cast(nn.LSTM, self.lstm_critic)
             self.lstm_critic = MirroredLSTM(critic, mirror)  # type: ignore[assignment]
