@@ -15,7 +15,7 @@ from tdgc.learn.recurrent import (
     FastRecurrentPPO,
     GaitNoise,
     MemoryExchange,
-    actor_parameters,
+    actor_and_critic,
     adapted_share,
     exchange_memories,
     gait_entropy,
@@ -228,11 +228,6 @@ def test_order_of_environments_is_drawn_from_numpys_generator():
     buffer.observations[:] = np.arange(ENVS)[:, None]
     assert order(0) == order(0) != order(1)
     assert order(0)[:ENVS] != order(0)[ENVS : 2 * ENVS]
-
-
-def actor_and_critic(policy: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-    actor = actor_parameters(policy)
-    return actor, [p for p in policy.parameters() if all(p is not a for a in actor)]
 
 
 def gradient_norm(parameters: list[nn.Parameter]) -> float:

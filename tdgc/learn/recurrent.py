@@ -341,10 +341,14 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
         return self.to_torch(np.stack(first))
 
 
-def actor_parameters(policy: nn.Module) -> list[nn.Parameter]:
-    """Parameters of a recurrent ``policy`` that decide its actions; its critic shares none."""
-    critic = "lstm_critic.", "mlp_extractor.value_net.", "value_net."
-    return [p for name, p in policy.named_parameters() if not name.startswith(critic)]
+def actor_and_critic(policy: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """Parameters of a recurrent ``policy`` that decide its actions, and those of its critic."""
+    of_critic = "lstm_critic.", "mlp_extractor.value_net.", "value_net."
+    actor: list[nn.Parameter] = []
+    critic: list[nn.Parameter] = []
+    for name, parameter in policy.named_parameters():
+        (critic if name.startswith(of_critic) else actor).append(parameter)
+    return actor, critic
 
 
 def adapted_share(share: float, kl: float, desired: float) -> float:
@@ -421,8 +425,7 @@ class FastRecurrentPPO(RecurrentPPO):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        actor = actor_parameters(self.policy)
-        critic = [p for p in self.policy.parameters() if all(p is not a for a in actor)]
+        actor, critic = actor_and_critic(self.policy)
         self.policy.optimizer = self.policy.optimizer_class(
             [{"params": actor}, {"params": critic}],
             lr=self.lr_schedule(1.0),  # type: ignore[call-arg]  # as in SB3

@@ -30,6 +30,9 @@ from tdgc.sim.geometry import Geometry
 
 Array = NDArray[np.float64]
 
+# Of the thigh's length: levers shorter than that are taken to be as long. Chosen by hand.
+_SHORTEST = 0.1
+
 
 def excess_momentum(body_rate: Array, q: Array, qd: Array) -> tuple[Array, Array]:
     """Derivatives of E / J with respect to the velocities and to the angles.
@@ -63,9 +66,6 @@ def excess_momentum(body_rate: Array, q: Array, qd: Array) -> tuple[Array, Array
     a, b, c = body_rate.T
     force[:, 12], force[:, 13], force[:, 14] = b * z - c * y, c * x - a * z, a * y - b * x
     return momentum, force
-
-
-_SHORTEST = 0.1  # of the thigh's length: levers shorter than that are taken to be as long
 
 
 def force_on_calf(
