@@ -8,6 +8,7 @@ docs/mujoco.md lists its settings. It needs the extra ``mujoco``.
 """
 
 import argparse
+import dataclasses
 import functools
 import sys
 from collections.abc import Sequence
@@ -26,14 +27,15 @@ from tdgc.benchmark.results import (
     describe,
     editions_of,
     make_room,
+    robot_changes,
     salvage,
     write_results,
 )
-from tdgc.config import HighLevelConfig, LowLevelConfig, to_dict, with_overrides
+from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict, with_overrides
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
 from tdgc.errors import require, script
-from tdgc.files import write_json
+from tdgc.files import checksum, write_json
 from tdgc.parallel.jobs import run_jobs
 from tdgc.show import film
 from tdgc.sim.commands import INDEX
@@ -42,6 +44,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
 from tdgc.sim.terrain import TileField
+from tdgc.sim.urdf import urdf_path
 from tdgc.tasks.rules import HORIZON
 
 if TYPE_CHECKING:
@@ -166,6 +169,14 @@ def run_cell(
     return episodes, recordings
 
 
+def robot_changes_of(controller: Controller) -> list[str]:
+    """List what the exported robot has in place of the benchmark's, see ``robot_changes``."""
+    robot, usual = controller.robot(), RobotConfig()
+    if checksum(Path(robot.urdf)) == checksum(urdf_path(usual)):  # the folder has a copy
+        robot = dataclasses.replace(robot, urdf=usual.urdf)
+    return robot_changes(LowLevelConfig(robot=robot))
+
+
 def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     """Run all cells and write all results; return problems with the films, one line each.
 
@@ -186,7 +197,7 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     )
     controller = load(args.export)
     tables = {"low": controller.low.table["policy"], "high": controller.high.table["policy"]}
-    trained_on = Training(editions_of(tables))
+    trained_on = Training(editions_of(tables), robot_changes_of(controller))
     episodes: list[Episode] = []
     recordings: list[Recording] = []
     with salvage(args.out, episodes, cells, trained_on) as bar:

@@ -5,6 +5,7 @@ import dataclasses
 import errno
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -26,6 +27,7 @@ from tdgc.deploy import log
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogError, LogWriter
 from tdgc.errors import WorkerError
+from tdgc.files import checksum
 from tdgc.sim import mujoco_world
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import Array, nominal_height, nominal_pose, yaw_quaternion
@@ -578,6 +580,28 @@ def test_what_is_complete_when_it_is_stopped_is_kept(
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert list(summary[runner.POLICY]["nominal"]) == ["rough", "mean"]
     assert summary["editions"] == {"tiles": 2, "low": 2, "high": 2}
+    assert "robot" not in summary
+
+
+def test_results_say_that_the_robot_is_not_the_benchmarks(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert runner.robot_changes_of(Controller(folder)) == []
+    pair = shutil.copytree(folder, tmp_path / "export")
+    path = pair / "low_interface.json"
+    table = json.loads(path.read_text())
+    table["joint_control"]["kp"]["value"] = [18.5] * 12
+    path.write_text(json.dumps(table))
+    urdf = pair / table["robot"]["urdf"]["file"]
+    urdf.write_text(urdf.read_text() + "<!-- mine -->")
+    table["robot"]["urdf"]["sha256"] = checksum(urdf)
+    path.write_text(json.dumps(table))
+    changes = [f'robot.urdf="{urdf}", not "urdf/quadruped.urdf"', "robot.kp=18.5, not 20.0"]
+    monkeypatch.setattr(evaluation, "HORIZON", 0.2)
+    given = ["--levels", "9", "--families", "rough", "--episodes", "1", "--workers", "1"]
+    out = tmp_path / "out"
+    assert runner.main(["--export", str(pair), *given, "--out", str(out)]) == 0
+    assert json.loads((out / "summary.json").read_text())["robot"] == changes
 
 
 class StubViewer:
