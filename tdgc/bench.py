@@ -41,10 +41,10 @@ from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
 from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy
+from tdgc.sim.families import FAMILIES
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS
-from tdgc.sim.terrain import FAMILIES
 from tdgc.tasks.high_observation import high_spaces
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import low_mirror, low_spaces

@@ -57,7 +57,8 @@ from tdgc.sim.geometry import Geometry, read_geometry
 from tdgc.sim.locomotion import Locomotion, actor_layout
 from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
-from tdgc.sim.terrain import TileField, make_tile
+from tdgc.sim.terrain import make_tile
+from tdgc.sim.tile import TileField
 from tdgc.sim.urdf import JOINTS, mesh_path, read_urdf
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_observation import SEMANTIC

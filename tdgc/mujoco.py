@@ -43,7 +43,7 @@ from tdgc.sim.display import WindowError
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import TileField
+from tdgc.sim.tile import TileField
 from tdgc.sim.urdf import urdf_path
 from tdgc.tasks.rules import HORIZON
 

@@ -21,7 +21,7 @@ from tdgc import export
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Cell, run_cell
 from tdgc.deploy.controller import Controller
-from tdgc.sim.terrain import FAMILIES
+from tdgc.sim.families import FAMILIES
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
 _LOW = [

@@ -14,7 +14,7 @@ from tdgc.benchmark.memory import Obstacles, Profile, Reckoning
 from tdgc.config import HighLevelConfig
 from tdgc.sim.commands import INDEX
 from tdgc.sim.robot import Array, wrap_angle
-from tdgc.sim.terrain import GOAL_X, START_X
+from tdgc.sim.tile import GOAL_X, START_X
 from tdgc.tasks.leaps import SPEED, Landing, LeapPlan, Motion, measure_landing
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES

@@ -27,7 +27,8 @@ from tdgc.sim.commands import NAMES, CommandDecoder, default_command, gait_index
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import JOINT_FLIP, columns, width
 from tdgc.sim.robot import nominal_pose
-from tdgc.sim.terrain import TILE_SIZE, make_tile
+from tdgc.sim.terrain import make_tile
+from tdgc.sim.tile import TILE_SIZE
 from tdgc.tasks import high_env, high_rewards
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.high_env import NavigationTask

@@ -16,7 +16,8 @@ from tdgc.sim.locomotion import GYRO_SCALE, SPEED_SCALE, Locomotion, actor_layou
 from tdgc.sim.observation import JOINT_FLIP, Flip, columns, width
 from tdgc.sim.robot import Array, nominal_pose, target_limits, walking_pose
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import TILE_SIZE, Tile, make_tile
+from tdgc.sim.terrain import make_tile
+from tdgc.sim.tile import TILE_SIZE, Tile
 from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.low_env import LowLevelTask
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, low_mirror

@@ -31,7 +31,7 @@ from tdgc.files import checksum
 from tdgc.sim import mujoco_world
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import Array, nominal_height, nominal_pose, yaw_quaternion
-from tdgc.sim.terrain import TileField
+from tdgc.sim.tile import TileField
 from tdgc.tasks.pairing import PRETRAINED
 
 ROBOT = RobotConfig()

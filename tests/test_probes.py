@@ -17,7 +17,8 @@ from tdgc.config import (
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import TileField, make_tile
+from tdgc.sim.terrain import make_tile
+from tdgc.sim.tile import TileField
 from tdgc.tasks.probes import (
     NUM_PROBES,
     PROBE_RANGE,

@@ -29,9 +29,9 @@ from tdgc.config import (
     RobotConfig,
 )
 from tdgc.sim.commands import CommandDecoder
+from tdgc.sim.families import ALL_FAMILIES, PARAMETER_RANGES
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.locomotion import actor_layout
-from tdgc.sim.terrain import ALL_FAMILIES, PARAMETER_RANGES
 from tdgc.tasks.high_observation import high_layout
 from tdgc.tasks.high_rewards import HIGH_TERMS
 from tdgc.tasks.low_rewards import LOW_TERMS

@@ -12,7 +12,7 @@ from tdgc.sim.geometry import read_geometry
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
 from tdgc.sim.rotors import excess_momentum, force_on_calf
-from tdgc.sim.terrain import TileField
+from tdgc.sim.tile import TileField
 from tdgc.sim.urdf import urdf_path
 
 ROBOT = RobotConfig()

@@ -10,7 +10,8 @@ import pytest
 from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.terrain import TileField, make_tile
+from tdgc.sim.terrain import make_tile
+from tdgc.sim.tile import TileField
 from tdgc.tasks import rules
 from tdgc.tasks.rules import OUTCOMES, has_failed, is_fallen, outcome
 

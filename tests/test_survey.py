@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tdgc.sim.terrain import CELL, EVAL_STREAM, FAMILIES, make_tile, tile_rng
+from tdgc.sim.families import FAMILIES
+from tdgc.sim.terrain import EVAL_STREAM, make_tile, tile_rng
+from tdgc.sim.tile import CELL
 from tdgc.tasks.survey import GRID, clearance, survey, travel_cost
 
 GOAL = np.array([7.25, 4.0])

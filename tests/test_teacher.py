@@ -11,7 +11,8 @@ from tdgc.config import CommandRanges, LowLevelConfig, PhysicsConfig, RobotConfi
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, CommandDecoder, gait_index
 from tdgc.sim.locomotion import Locomotion
-from tdgc.sim.terrain import CELL, Tile, TileField, make_tile
+from tdgc.sim.terrain import make_tile
+from tdgc.sim.tile import CELL, Tile, TileField
 from tdgc.tasks.leaps import SWING_HEIGHT, Landing
 from tdgc.tasks.teacher import LEAPING, SIGHT, SLOPING, UNEVEN, WAY, Skill, Teacher
 

@@ -6,19 +6,15 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
-from tdgc.sim import terrain
-from tdgc.sim.terrain import (
+from tdgc.sim.families import (
     ALL_FAMILIES,
-    EVAL_STREAM,
     FAMILIES,
-    TRAIN_STREAM,
-    Tile,
-    TileField,
+    PILLAR_DIAMETER,
     difficulty_parameter,
-    draw_start_goal,
-    make_tile,
-    tile_rng,
+    draw_cylinders,
 )
+from tdgc.sim.terrain import EVAL_STREAM, TRAIN_STREAM, file_label, make_tile, tile_rng
+from tdgc.sim.tile import HEIGHT_RANGE, WHOLE_ZONE, Section, Tile, TileField, draw_start_goal
 
 DIFFICULTIES = [level / 10 for level in range(13)]
 MIDDLE = 80  # sample at x = 4 m or y = 4 m
@@ -60,7 +56,7 @@ def test_every_tile_is_flat_on_its_platforms_and_within_range(family, difficulty
         for surface in (made.heights, made.support):
             assert (surface[:26] == 0).all()  # x <= 1.25
             assert (surface[135:] == 0).all()  # x >= 6.75
-            low, high = terrain.HEIGHT_RANGE
+            low, high = HEIGHT_RANGE
             assert low < surface.min() and surface.max() < high
 
 
@@ -117,7 +113,7 @@ def test_a_tile_of_a_height_map(tmp_path):
     starts = [make_tile(f, 1.0, tile_rng(0, f, 10, 0)).start[1] for f in (name, "rough")]
     assert starts[0] != starts[1]
     assert make_tile(name, 1.0, tile_rng(0, name, 10, 0)).start[1] == starts[0]
-    assert terrain.file_label("maps/my hills.npy") == "maps-my-hills.npy"
+    assert file_label("maps/my hills.npy") == "maps-my-hills.npy"
 
 
 @pytest.mark.parametrize(
@@ -214,9 +210,7 @@ def test_pillar_count_and_height(difficulty, count):
 
 def test_pillars_keep_clear_and_inside():
     for seed in range(40):
-        x, y, d = terrain.draw_cylinders(
-            terrain.WHOLE_ZONE, 28, terrain.PILLAR_DIAMETER, np.random.default_rng(seed)
-        ).T
+        x, y, d = draw_cylinders(WHOLE_ZONE, 28, PILLAR_DIAMETER, np.random.default_rng(seed)).T
         assert len(x) == 28
         assert d.min() >= 0.2 and d.max() <= 0.4 and np.ptp(d) > 0.1
         assert (x - d / 2).min() >= 1.5 and (x + d / 2).max() <= 6.5
@@ -226,9 +220,9 @@ def test_pillars_keep_clear_and_inside():
 
 
 def test_pillars_that_cannot_fit_raise():
-    narrow = terrain.Section(1.5, 1.5, 2.0, 2.0)
+    narrow = Section(1.5, 1.5, 2.0, 2.0)
     with pytest.raises(RuntimeError, match=r"no room for 28 cylinders"):
-        terrain.draw_cylinders(narrow, 28, terrain.PILLAR_DIAMETER, np.random.default_rng(0))
+        draw_cylinders(narrow, 28, PILLAR_DIAMETER, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(("difficulty", "step"), [(0, 0.02), (0.5, 0.085), (1, 0.15)])

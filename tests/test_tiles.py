@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tdgc.sim.terrain import Tile, make_tile, tile_rng
+from tdgc.sim.terrain import make_tile, tile_rng
+from tdgc.sim.tile import Tile
 from tdgc.tasks.tiles import FLAT, TrainingTiles, check_families, left_out
 
 FAMILIES = ("stair", FLAT, "rough")

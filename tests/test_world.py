@@ -15,18 +15,12 @@ import pytest
 
 from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.sim.bullet_world import CLIENT_ROBOTS, PLANE_CLIENT_ROBOTS, BulletWorld
+from tdgc.sim.families import ALL_FAMILIES, CLUTTER, FAMILIES
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, foot_kinematics, nominal_pose, yaw_quaternion
-from tdgc.sim.terrain import (
-    ALL_FAMILIES,
-    CLUTTER,
-    FAMILIES,
-    HEIGHT_RANGE,
-    TileField,
-    make_tile,
-    tile_rng,
-)
+from tdgc.sim.terrain import make_tile, tile_rng
+from tdgc.sim.tile import HEIGHT_RANGE, TileField
 from tdgc.tasks.rules import is_fallen
 
 ROBOT, PHYSICS = RobotConfig(), PhysicsConfig()

@@ -27,7 +27,7 @@ from tdgc.files import write_json
 from tdgc.learn.run import signals_restored
 from tdgc.parallel.cores import Workers
 from tdgc.policies.acting import without_correction
-from tdgc.sim.terrain import UNNAMED
+from tdgc.sim.families import UNNAMED
 from tdgc.tasks.pairing import load_low
 from tdgc.tasks.rules import OUTCOMES
 from tdgc.tasks.tiles import FLAT

@@ -16,7 +16,7 @@ from tdgc.sim.commands import INDEX, CommandDecoder, default_command
 from tdgc.sim.gaits import raw_phase
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
-from tdgc.sim.terrain import GOAL_X, ZONE
+from tdgc.sim.tile import GOAL_X, ZONE
 from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
 from tdgc.tasks.leaps import (
     BEYOND,

@@ -25,18 +25,10 @@ from numpy.typing import ArrayLike, NDArray
 from tdgc.benchmark.evaluation import Episode, EpisodeRecord
 from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
 from tdgc.files import atomic
+from tdgc.sim.families import MAX_LEVEL, UNNAMED
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import (
-    CELL,
-    GOAL_BEGIN,
-    MAX_LEVEL,
-    START_END,
-    TILE_SIZE,
-    UNNAMED,
-    ZONE,
-    Tile,
-    is_map,
-)
+from tdgc.sim.terrain import is_map
+from tdgc.sim.tile import CELL, GOAL_BEGIN, START_END, TILE_SIZE, ZONE, Tile
 from tdgc.tasks.survey import corridor_at, find_trenches
 
 LAYERS = ("decisions", "execution", "terrain")

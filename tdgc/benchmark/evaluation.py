@@ -21,20 +21,13 @@ from tdgc.config import LowLevelConfig, PhysicsConfig, RandomisationConfig
 from tdgc.policies import Policy
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import gait_index
+from tdgc.sim.families import MAX_LEVEL
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import EpisodeDraws, Noise
-from tdgc.sim.terrain import (
-    EVAL_STREAM,
-    MAX_LEVEL,
-    Tile,
-    TileField,
-    family_number,
-    file_label,
-    make_tile,
-    tile_rng,
-)
+from tdgc.sim.terrain import EVAL_STREAM, family_number, file_label, make_tile, tile_rng
+from tdgc.sim.tile import Tile, TileField
 from tdgc.sim.world import World
 from tdgc.tasks.executor import Carries, Executor
 from tdgc.tasks.pairing import mdp_of

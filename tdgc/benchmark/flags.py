@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from tdgc.parallel.cores import usable_cores, workers_flag
-from tdgc.sim.terrain import ALL_FAMILIES, FAMILIES, MAP_ENDING, OOD_LEVELS, height_map, is_map
+from tdgc.sim.families import ALL_FAMILIES, FAMILIES, OOD_LEVELS
+from tdgc.sim.terrain import MAP_ENDING, height_map, is_map
 
 Group: TypeAlias = argparse._ArgumentGroup
 

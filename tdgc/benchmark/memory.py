@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.sim.robot import Array, wrap_angle
-from tdgc.sim.terrain import GOAL_X, START_X, TILE_SIZE
+from tdgc.sim.tile import GOAL_X, START_X, TILE_SIZE
 from tdgc.tasks.planning import LOOK, between, cost_to_go, price_near
 from tdgc.tasks.rules import GOAL_RADIUS
 

@@ -37,11 +37,11 @@ from tdgc.config import HighLevelConfig, LowLevelConfig
 from tdgc.errors import script
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, VELOCITIES
+from tdgc.sim.families import FAMILIES
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import FAMILIES
 from tdgc.sim.urdf import JOINTS
 from tdgc.tasks.high_observation import high_layout
 from tdgc.tasks.pairing import PRETRAINED, load_low

@@ -27,7 +27,7 @@ from tdgc.sim.bullet_world import Stage
 from tdgc.sim.commands import CONTINUOUS, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import TILE_SIZE, Tile, TileField
+from tdgc.sim.tile import TILE_SIZE, Tile, TileField
 from tdgc.tasks.rules import GOAL_RADIUS
 
 FRAME_SECONDS = 0.04  # 25 frames per second: every second control step

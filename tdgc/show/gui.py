@@ -27,7 +27,7 @@ from tdgc.sim.display import WindowError
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import TileField
+from tdgc.sim.tile import TileField
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.rules import GOING, OUTCOMES, outcome

@@ -28,7 +28,7 @@ from tdgc.files import atomic
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import TILE_SIZE
+from tdgc.sim.tile import TILE_SIZE
 from tdgc.tasks.rules import GOAL_RADIUS
 
 # Okabe and Ito's palette, whose colours colour-blind readers can distinguish.

@@ -29,7 +29,7 @@ from tdgc.sim.robot import (
     rotation_matrix,
 )
 from tdgc.sim.rotors import excess_momentum, force_on_calf
-from tdgc.sim.terrain import CELL, HEIGHT_RANGE, TILE_SAMPLES, TileField
+from tdgc.sim.tile import CELL, HEIGHT_RANGE, TILE_SAMPLES, TileField
 from tdgc.sim.urdf import JOINTS, merged_file, read_urdf, urdf_path
 from tdgc.sim.world import World
 

@@ -20,7 +20,7 @@ from tdgc.config.settings import NotNegative, Positive
 from tdgc.sim.display import WindowError, check_display
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import GRAVITY, Array, pd_torque, rotation_matrix
-from tdgc.sim.terrain import CELL, TileField
+from tdgc.sim.tile import CELL, TileField
 from tdgc.sim.urdf import JOINTS, urdf_path
 from tdgc.sim.world import World
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from tdgc.config import PhysicsConfig, RobotConfig
 from tdgc.sim.geometry import Geometry
 from tdgc.sim.robot import Array, RobotState
-from tdgc.sim.terrain import TileField
+from tdgc.sim.tile import TileField
 
 
 class World(ABC):

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from tdgc.config import LowLevelConfig
 from tdgc.sim.commands import INDEX, command_bounds
+from tdgc.sim.families import MAX_LEVEL
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, to_goal, wrap_angle
-from tdgc.sim.terrain import MAX_LEVEL, TILE_SIZE, TileField
+from tdgc.sim.tile import TILE_SIZE, TileField
 from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.episodes import Episodes
 from tdgc.tasks.ground import Ground

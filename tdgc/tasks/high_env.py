@@ -19,7 +19,7 @@ from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import draw_start_goal
+from tdgc.sim.tile import draw_start_goal
 from tdgc.state import State, copies, fill
 from tdgc.tasks.curriculum import Curriculum
 from tdgc.tasks.executor import Executor

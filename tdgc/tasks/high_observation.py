@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tdgc.config import CommandRanges, ConfigError, HighLevelConfig
 from tdgc.policies import Mirror
 from tdgc.sim.commands import CONTINUOUS, NUM_ACTIONS, SIDEWAYS
+from tdgc.sim.families import FAMILIES
 from tdgc.sim.locomotion import SPEED_SCALE, Locomotion
 from tdgc.sim.observation import (
     JOINT_FLIP,
@@ -25,7 +26,6 @@ from tdgc.sim.observation import (
 )
 from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import FAMILIES
 from tdgc.tasks.leaps import FREQUENCIES, LENGTHS
 from tdgc.tasks.probes import NUM_PROBES, PROBE_RANGE, PROBE_SWAP, PROBES, HeightProbes
 from tdgc.tasks.teacher import WAY

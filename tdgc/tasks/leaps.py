@@ -20,7 +20,7 @@ from tdgc.sim.commands import INDEX
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import TILE_SIZE
+from tdgc.sim.tile import TILE_SIZE
 from tdgc.tasks.executor import Executor
 
 if TYPE_CHECKING:  # the low policy's workers do not load PyTorch

@@ -21,7 +21,7 @@ from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.observation import observe
 from tdgc.sim.robot import Array
 from tdgc.sim.sensors import Noise
-from tdgc.sim.terrain import TILE_SIZE, draw_start_goal
+from tdgc.sim.tile import TILE_SIZE, draw_start_goal
 from tdgc.state import State, copies, fill
 from tdgc.tasks.command_draw import PRONK, CommandDraw
 from tdgc.tasks.crossings import Crossings

@@ -13,7 +13,8 @@ import numpy as np
 from tdgc.config import FIRST_TEACHER, CommandRanges, HighLevelConfig, TeacherConfig, recorded
 from tdgc.policies import Policy
 from tdgc.sim.commands import NUM_ACTIONS
-from tdgc.sim.terrain import MAX_LEVEL, may_have_trenches
+from tdgc.sim.families import MAX_LEVEL
+from tdgc.sim.terrain import may_have_trenches
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.pairing import mdp_of

@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from tdgc.sim.robot import Array
-from tdgc.sim.terrain import CELL, TILE_SIZE, Y_SPREAD
+from tdgc.sim.tile import CELL, TILE_SIZE, Y_SPREAD
 from tdgc.tasks.planning import RADIUS, cost_to_go, price_near
 
 Mask = NDArray[np.bool_]

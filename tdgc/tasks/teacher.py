@@ -18,7 +18,7 @@ from tdgc.config import CommandRanges, TeacherConfig
 from tdgc.sim.commands import INDEX, VELOCITIES, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, to_goal, wrap_angle
-from tdgc.sim.terrain import CELL, TILE_SAMPLES, TILE_SIZE, TileField
+from tdgc.sim.tile import CELL, TILE_SAMPLES, TILE_SIZE, TileField
 from tdgc.tasks.leaps import (
     BEYOND,
     FREQUENCIES,

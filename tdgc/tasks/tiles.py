@@ -9,17 +9,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.sim.terrain import (
-    MAX_LEVEL,
-    TILE_SAMPLES,
-    TRAIN_STREAM,
-    TRENCH_DEPTH,
-    Tile,
-    TileField,
-    check_family,
-    make_tile,
-    tile_rng,
-)
+from tdgc.sim.families import MAX_LEVEL, TRENCH_DEPTH
+from tdgc.sim.terrain import TRAIN_STREAM, check_family, make_tile, tile_rng
+from tdgc.sim.tile import TILE_SAMPLES, Tile, TileField
 from tdgc.state import State, copies, fill
 
 # Training tiles are 4 m wide, since Bullet keeps 600 bytes for each sample of a height field.
