@@ -23,10 +23,10 @@ from tdgc.errors import InputError, require
 from tdgc.files import atomic
 from tdgc.parallel.jobs import run_jobs
 from tdgc.show.plots import DESIRED, GAIT_COLOURS, MEASURED, POLICY_COLOURS, sheet
-from tdgc.sim.bullet_world import Stage
 from tdgc.sim.commands import CONTINUOUS, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array
+from tdgc.sim.stage import Stage
 from tdgc.sim.tile import TILE_SIZE, Tile, TileField
 from tdgc.tasks.rules import GOAL_RADIUS
 

@@ -13,7 +13,7 @@ from tdgc.benchmark.drivers import Driver
 from tdgc.benchmark.evaluation import CONDITIONS, Batch, Cell, benchmarked, run_cell, tile_of
 from tdgc.policies import Policy
 from tdgc.show.film import set_stage
-from tdgc.sim.bullet_world import BulletWorld, Stage
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import (
     CONTINUOUS,
     INDEX,
@@ -27,6 +27,7 @@ from tdgc.sim.display import WindowError
 from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
+from tdgc.sim.stage import Stage
 from tdgc.sim.tile import TileField
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import mdp_of
