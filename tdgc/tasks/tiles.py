@@ -16,7 +16,7 @@ from tdgc.state import State, copies, fill
 
 # Training tiles are 4 m wide, since Bullet keeps 600 bytes for each sample of a height field.
 TILE_CROP = 2.0  # m, on either side
-#: A training family besides those of ``tdgc.sim.terrain``: flat ground at height 0 on every level.
+#: A training family besides those of ``tdgc.sim.families``: flat ground at height 0 on every level.
 FLAT = "flat"
 # Episodes on one tile while the level stays the same. A tile that is used too often is memorised,
 # but loading a new one into Bullet takes 80 ms, a third of the time that 50 robots need for a
