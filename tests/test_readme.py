@@ -37,8 +37,10 @@ from tdgc.tasks.high_rewards import HIGH_TERMS
 from tdgc.tasks.low_rewards import LOW_TERMS
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FOLDER = {path.name: path.parent for path in DOCUMENTS}
 TEXT = {path.name: path.read_text(encoding="utf-8") for path in DOCUMENTS}
+assert len(TEXT) == len(DOCUMENTS), "two documents have the same name"
 MAINS = {
     "train_low.py": train_low.main,
     "train_high.py": train_high.main,
@@ -458,7 +460,7 @@ def anchors(text: str) -> set[str]:
 
 @pytest.mark.parametrize("name", TEXT)
 def test_what_is_named_is_there(name: str) -> None:
-    text, folder = TEXT[name], ROOT if (ROOT / name).is_file() else ROOT / "docs"
+    text, folder = TEXT[name], FOLDER[name]
     paths = re.findall(r"(?:tdgc|docs|tests|urdf|pairs|\.ci)/[\w/.-]*\w", text)
     made = ("tdgc/LowLevel-v0", "tdgc/Navigation-v0", "docs/robot.gif")
     places = [link.split("#") for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text)]
