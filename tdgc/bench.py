@@ -330,6 +330,8 @@ def check_flags(args: argparse.Namespace) -> None:
     for name, default in (("robots", _ROBOTS), ("workers", "auto"), ("seconds", _SECONDS)):
         if getattr(args, name) is None:
             setattr(args, name, default)
+    if args.robots < 1:
+        raise InputError(f"--robots must be at least 1, not {args.robots}")
     if not 0.0 < args.seconds < math.inf:
         raise InputError(f"--seconds must be above 0, not {args.seconds:g}")
 

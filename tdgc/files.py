@@ -51,7 +51,7 @@ def write_text(path: Path, text: str) -> None:
         OSError: the file cannot be written.
     """
     with atomic(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        write_synced(partial, text.encode())
 
 
 def write_json(path: Path, value: Any) -> None:

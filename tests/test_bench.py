@@ -110,7 +110,7 @@ def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
     ("flags", "message"),
     [
         ("--robots 2 --workers 3", "--workers must be 1 to the number of robots\n"),
-        ("--robots 0", "--workers must be 1 to the number of robots\n"),
+        ("--robots 0", "--robots must be at least 1, not 0\n"),
         ("--load --workers 2", "--load has its own settings: no --workers\n"),
         ("--update --seconds 5", "--update has its own settings: no --seconds\n"),
         ("--seconds 0", "--seconds must be above 0, not 0\n"),

@@ -1,5 +1,6 @@
 """Worker faults: death, hang, exception, robots that blow up, and a parent that is gone."""
 
+import errno
 import json
 import os
 import signal
@@ -7,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from stubs import DIE, FAR, HANG, INFINITE, NAN_EARNED, NAN_SEEN, RAISE, Fragile
 from tdgc.config import LowLevelConfig, PhysicsConfig, RobotConfig
 from tdgc.errors import WorkerError
 from tdgc.parallel.vec import FAULT_STEPS, Fault, TaskVecEnv, worker_seed
+from tdgc.parallel.worker import ProcessLink
 from tdgc.sim.observation import columns
 from tdgc.state import join, split
 from tdgc.tasks.low_env import LowLevelTask
@@ -127,6 +129,37 @@ def test_a_worker_that_hangs_is_started_anew() -> None:
     assert env.faults[0].reason == "worker 0 gave no answer for 1.5 s"
     obs, _, dones, _ = step(env, actions(2))
     assert not dones.any() and (obs[:, 2] == 1.0).all()
+    env.close()
+
+
+class ScarceLink(ProcessLink):
+    """A worker for which there is no process where ``refused`` says so, call by call."""
+
+    refused: ClassVar[list[bool]] = []
+
+    def __init__(self, *arguments: Any) -> None:
+        if self.refused and self.refused.pop(0):
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        super().__init__(*arguments)
+
+
+@pytest.mark.parametrize("refusals", [1, 2])
+def test_a_worker_that_cannot_be_started_is_one_more_fault(refusals: int) -> None:
+    env = TaskVecEnv(Fragile, 2, 1, seed=3, spaces=SPACES, recover=True, link=ScarceLink)
+    env.reset()
+    step(env, actions(2))
+    env.state_dicts()
+    ScarceLink.refused = [True] * refusals
+    reason = "worker 0 did not start: Resource temporarily unavailable"
+    if refusals == 1:
+        _, _, dones, _ = step(env, actions(2, r0=RAISE))
+        assert dones.all() and [fault.restarts for fault in env.faults] == [1, 2]
+        assert env.faults[1].reason == reason
+        step(env, actions(2))
+    else:
+        with pytest.raises(WorkerError, match=f"the last one: {reason}$"):
+            step(env, actions(2, r0=RAISE))
+    assert [state["level"] for state in env.state_dicts()] == [2 if refusals == 1 else 1]
     env.close()
 
 

@@ -1,5 +1,6 @@
 """Jobs shared among processes: results come in order, and a process that dies is reported."""
 
+import multiprocessing as mp
 import os
 import time
 
@@ -37,6 +38,21 @@ def test_what_a_job_raises_is_raised() -> None:
 def test_a_process_that_dies_is_told() -> None:
     with pytest.raises(WorkerError, match=r"^a process died, perhaps out of memory$"):
         list(run_jobs(die, range(4), 2))
+
+
+def die_or_answer_late(number: int) -> bytes:
+    if number == 0:
+        os._exit(9)
+    time.sleep(0.5)
+    return bytes(10**6)  # more than a pipe holds
+
+
+def test_the_others_are_not_waited_for_when_a_process_dies() -> None:
+    with pytest.raises(WorkerError, match=r"^a process died"):
+        list(run_jobs(die_or_answer_late, range(8), 2))
+    for child in mp.active_children():
+        child.join(10.0)
+    assert not mp.active_children()
 
 
 def test_who_wants_no_more_results_waits_for_none() -> None:

@@ -32,12 +32,12 @@ def run_jobs(work: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
             with signals_left_to_parent():
                 results = pool.map(work, jobs)  # starts the processes
             yield from results
-        except BrokenProcessPool:
-            raise WorkerError("a process died, perhaps out of memory") from None
-        except BaseException:  # the jobs under way are no longer needed
+        except BaseException as error:  # the jobs under way are no longer needed
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(mp.active_children()) - others:
-                process.kill()  # it blocks SIGTERM
+                process.kill()  # it blocks SIGTERM, with which a pool ends its processes
+            if isinstance(error, BrokenProcessPool):
+                raise WorkerError("a process died, perhaps out of memory") from None
             raise
 
 

@@ -141,7 +141,10 @@ class TaskVecEnv(VecEnv):
         self._links[worker].end(0.0)
         self._broken.pop(worker, None)
         self._restarts[worker] = restarts
-        self._links[worker] = self._start(worker, state)
+        try:
+            self._links[worker] = self._start(worker, state)
+        except OSError as error:  # as when memory or processes run out
+            self._broken[worker] = WorkerError(f"worker {worker} did not start: {error.strerror}")
 
     @property
     def worker_pids(self) -> list[int]:

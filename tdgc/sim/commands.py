@@ -59,8 +59,8 @@ def default_command() -> NDArray[np.float64]:
 
 
 #: Unit in which the networks see a command's distance from its default, chosen so that inputs stay
-#: within about [-1, 1]; for most commands it is about half the range. The embedding has a default
-#: of 0 here, so its entries become 0 or 1.
+#: within about [-1, 1], swing height up to 1.6; for most commands it is about half the range. The
+#: embedding has a default of 0 here, so its entries become 0 or 1.
 _OBSERVATION_UNIT: NDArray[np.float64] = np.array(
     [1.0, 0.5, 1.0, 0.1, 1.0, 0.1, 0.1, 0.3, 0.2, 0.1, 0.05, 0.002, 0.5, 0.5, 0.5]
 )

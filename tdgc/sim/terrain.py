@@ -6,6 +6,7 @@ diagnosis, and to test what reads them from the heights. A family may also be a 
 
 import functools
 import re
+import zipfile
 import zlib
 from collections.abc import Sequence
 
@@ -44,8 +45,7 @@ EDITION = 2
 #: A family name with this ending is the path of a user's height map, see ``height_map``.
 MAP_ENDING = ".npy"
 
-# Of Ditches, which are our own addition: even the shortest part has room for two trenches, or for
-# four of Stair's risers.
+# Of Ditches, which are our own addition: even the shortest part has room for two trenches.
 SHORTEST_PART = 1.5  # m
 
 # First entry of every tile's seed. It differs between the streams, so that no training tile is ever
@@ -123,7 +123,7 @@ def height_map(path: str) -> FloatArray:
     """
     try:
         heights = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"terrain '{path}' cannot be read as a NumPy file: {error}") from error
     shape = (TILE_SAMPLES, TILE_SAMPLES)
     real = isinstance(heights, np.ndarray) and heights.dtype.kind in "fiu"

@@ -113,7 +113,10 @@ class Tile:
     cell: float = CELL
 
     def mirrored(self) -> "Tile":
-        """The same tile with left and right exchanged."""
+        """The same tile with left and right exchanged.
+
+        Between samples the ground differs: simulators split every cell along the same diagonal.
+        """
         found, turned = self.features, np.array([1.0, -1.0, -1.0])
         pillars = found.pillars.copy()
         pillars[:, 1] = TILE_SIZE - pillars[:, 1]
