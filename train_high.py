@@ -331,6 +331,12 @@ def check(config: HighTrainConfig, control_dt: float) -> None:
             )
         steps = ppo.n_steps * config.n_envs // minibatches
         check_batch(f"'ppo.n_steps' times 'n_envs' per '{name}.minibatches'", steps)
+        made = ppo.n_steps * config.n_envs // steps  # by SB3, which only knows their size
+        if made != minibatches:
+            raise ConfigError(
+                f"'{name}.minibatches' cannot be {minibatches} with {config.n_envs} robots of "
+                f"{ppo.n_steps} steps; {made} can"
+            )
     episode_steps(env.episode_seconds, env.decimation * control_dt)
     if not ppo.ent_coef:  # SB3 multiplies both terms by it
         for name, used in (("gait_ent_coef", True), ("imitation_coef", config.imitation.steps)):

@@ -50,13 +50,7 @@ from tdgc.tasks.tiles import check_families, check_levels, left_out
 
 
 def phases(config: LowTrainConfig, machine: Machine) -> list[Phase]:
-    """Return the one phase of learning: robots on a plane, and on tiles with rising levels.
-
-    Raises:
-        ConfigError: ``plane_share`` is outside [0, 1).
-    """
-    if not 0.0 <= config.plane_share < 1.0:
-        raise ConfigError(f"'plane_share' must be from 0 to below 1, not {config.plane_share:g}")
+    """Return the one phase of learning: robots on a plane, and on tiles with rising levels."""
     env = config.env
     # Feet cannot sink into a plane, so there a physics step may be as long as a torque is held.
     steps = env.physics.joint_steps
@@ -75,9 +69,17 @@ def check(config: LowTrainConfig) -> None:
     """
     if config.env.terrain != LowLevelConfig.terrain:
         raise ConfigError("'env.terrain' has no effect: robots train on both, see plane_share")
+    if config.plane_share == 1.0:
+        raise ConfigError("'plane_share' must be from 0 to below 1, not 1")
     check_batch("'ppo.batch_size'", config.ppo.batch_size)
     check_batch("'ppo.n_steps' times 'n_envs'", config.ppo.n_steps * config.n_envs)
-    episode_steps(config.env.episode_seconds, config.env.physics.control_dt)
+    step = config.env.physics.control_dt
+    episode_steps(config.env.episode_seconds, step)
+    if config.env.command_seconds and not round(config.env.command_seconds / step):
+        raise ConfigError(
+            f"'env.command_seconds' must be 0 or last a step of {step:g} s, "
+            f"not {config.env.command_seconds:g}"
+        )
     if 0 < config.calibration.robots < LEAST_ROBOTS:
         raise ConfigError(
             f"'calibration.robots' must be 0 or at least {LEAST_ROBOTS}, "
@@ -154,6 +156,10 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
         except StoppedError:
             interruption.tell(out)
             return
+        except ConfigError as error:
+            raise ConfigError(
+                f"{error}; --resume with --set calibration.robots=0 leaves the policy as it is"
+            ) from None
     policies.save_copy(out / "uncalibrated", learned, learned.meta)
     meta = {**learned.meta, "calibration": facts}
     policies.save_copy(out / "policy", learned, meta, correction)

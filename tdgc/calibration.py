@@ -238,7 +238,7 @@ def calibrate(
     if len(given) < _LEAST_WALKED:
         raise ConfigError(
             f"only {len(given)} of {robots} robots walked without a fall, which is too few to "
-            "calibrate; calibration.robots=0 leaves the policy as it is"
+            "calibrate"
         )
     response = ResponseModel(given, reached, config.commands, seed)
     tick(_FITTED)

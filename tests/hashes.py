@@ -1,4 +1,4 @@
-"""Hashes of what a rebuild must not change: episodes, trained policies and an exported graph.
+"""Hashes of what a refactoring must not change: episodes, trained policies and an exported graph.
 
     python -m tests.hashes
 

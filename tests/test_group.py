@@ -116,4 +116,4 @@ def test_a_share_of_each_workers_robots_stays_on_the_plane() -> None:
 def test_all_robots_on_the_plane_is_refused() -> None:
     config = dataclasses.replace(LowTrainConfig(), plane_share=1.0)
     with pytest.raises(ConfigError, match="'plane_share' must be from 0 to below 1, not 1"):
-        train_low.phases(config, MACHINE)
+        train_low.check(config)

@@ -198,6 +198,7 @@ def test_a_symmetric_policy_needs_the_same_bounds_to_both_sides():
         high_mirror(dataclasses.replace(CONFIG, commands=ranges))
     with pytest.raises(ConfigError, match=r"^probes that are staggered are not the same on both"):
         high_mirror(dataclasses.replace(CONFIG, probes="staggered"))
+    high_mirror(dataclasses.replace(CONFIG, probes="staggered", cues="semantic"))  # sees none
 
 
 def test_the_teachers_episodes_move_no_levels():

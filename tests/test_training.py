@@ -475,7 +475,9 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
         assert train_low.main(["--resume", "--out", str(broken), *flags]) == 2
         assert "--resume keeps the run's seed, 3: no other seed" in "".join(capfd.readouterr())
     for name, before, now in (
-        ("ppo.initial_std", 1.0, 0.5), ("env.command_start", 0.4, 0.5), ("env.first_levels", 3, 1)
+        ("ppo.initial_std", 1.0, 0.5), ("env.command_start", 0.4, 0.5), ("env.first_levels", 3, 1),
+        ("env.families", ["stair", "gap"], '["rough","gap"]'),
+        ("env.crossing.shallowest_trench", 0.05, 0.1),
     ):  # fmt: skip
         assert train_low.main(["--resume", "--out", str(broken), "--set", f"{name}={now}"]) == 2
         said = f"--resume keeps the run's {name}, {before}: no other {name}\n"
@@ -748,6 +750,10 @@ def test_faults_of_a_run(
     last = Checkpoint.read(newest(tmp_path))
     assert last.steps == 96 and last.header["workers"][0]["restarts"] == 3
     assert all(tensor.isfinite().all() for tensor in last.tensors.values())
+    logged = [
+        (row["steps"], fault["restarts"]) for row in rows(tmp_path) for fault in row["faults"]
+    ]
+    assert logged == [(48, 1), (80, 2), (96, 3)]  # the last one, of a rollout that was lost, too
     assert set(multiprocessing.active_children()) <= others
 
 
@@ -794,6 +800,11 @@ def test_flags_and_folders_that_cannot_be_used(
             "--set",
             "env.episode_seconds=0.005",
         ],
+        "'env.command_seconds' must be 0 or last a step of 0.02 s, not 0.005": [
+            "--set",
+            "env.command_seconds=0.005",
+        ],
+        "'plane_share' must be from 0 to below 1, not 1": ["--set", "plane_share=1"],
         "'calibration.robots' must be 0 or at least 64": ["--set", "calibration.robots=63"],
         "--worker-timeout must be above 0 and at most 86400, not inf": ["--worker-timeout", "inf"],
         "--time-limit must be at least 0 s, not nan": ["--time-limit", "nan"],
@@ -834,6 +845,10 @@ def test_flags_and_folders_that_cannot_be_used(
         ("ppo.minibatches=0", "'ppo.minibatches' must be at least 1, not 0"),
         ("ppo.minibatches=101", "'ppo.minibatches' must be at most the 100 robots, not 101"),
         ("imitation.minibatches=101", "'imitation.minibatches' must be at most the 100 robots"),
+        (
+            "ppo.minibatches=97",
+            "'ppo.minibatches' cannot be 97 with 100 robots of 24 steps; 100 can",
+        ),
         ("ppo.initial_std=0", "'ppo.initial_std' must be above 0, not 0"),
         ("seed=-1", "'seed' must be at least 0, not -1"),
         ("steps=0", "'steps' must be at least 1, not 0"),

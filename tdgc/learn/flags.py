@@ -24,10 +24,12 @@ from tdgc.parallel.worker import MakeLink, ProcessLink
 _LONGEST = 86400.0  # s, of a worker's silence: one day; waiting on a pipe overflows at 25 days
 TrainConfig = TypeVar("TrainConfig", LowTrainConfig, HighTrainConfig)
 _TRAINERS = {LowTrainConfig: "train_low.py", HighTrainConfig: "train_high.py"}
-#: Settings that act when a run begins, so that a resumed run cannot change them.
+#: Settings that a resumed run cannot change: they act when a run begins, or shape the ground, on
+#: which episodes are under way.
 _AT_START = (
     "seed", "start_speed", "start_swing", "ppo.initial_std", "ppo.initial_gait_std",
-    "env.first_level", "env.first_levels", "env.command_start",
+    "env.first_level", "env.first_levels", "env.command_start", "env.families",
+    "env.shallowest_trench", "env.crossing.shallowest_trench",
 )  # fmt: skip
 
 
@@ -154,10 +156,14 @@ def _keep_start(before: Any, now: Any) -> None:
         ConfigError: names the setting and its value.
     """
     for name in _AT_START:
-        *tables, key = name.split(".")
-        then, new = (functools.reduce(dict.__getitem__, tables, table) for table in (before, now))
-        if key in then and new[key] != then[key]:
-            raise ConfigError(f"--resume keeps the run's {name}, {then[key]}: no other {name}")
+        then, new = (_setting(name.split("."), table) for table in (before, now))
+        if then != new:
+            raise ConfigError(f"--resume keeps the run's {name}, {then}: no other {name}")
+
+
+def _setting(path: list[str], table: Any) -> Any:
+    """The entry of nested tables at ``path``, or None if this kind of run has no such setting."""
+    return functools.reduce(lambda part, key: (part or {}).get(key), path, table)
 
 
 def _fits(kind: type[LowTrainConfig] | type[HighTrainConfig], table: Any) -> bool:

@@ -6,7 +6,7 @@ and every step carries the gradients of all weights along. But episodes start on
 of a piece, so only the states before the pieces need zeroing, and each LSTM is called once.
 
 A minibatch holds whole environments, as in OpenAI Baselines' PPO2 for recurrent policies: only the
-LSTMs see padding, and only where an episode starts within the rollout.
+encoders and LSTMs see padding, and only where an episode starts within the rollout.
 """
 
 import functools
@@ -77,7 +77,8 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
     """``MlpLstmPolicy`` with a fast ``evaluate_actions``; for ``FastRecurrentPPO``, which also
     makes its optimiser.
 
-    It takes the same arguments, has the same parameters and computes the same numbers. With a
+    It takes the same arguments, has the same parameters and computes the same numbers, but Adam's
+    ``eps`` is 1e-8 by default. With a
     ``mirror``, the policy and its value are exactly left-right symmetric. If ``lstm_hidden_size``
     is None, the policy is feed-forward and consists only of the networks behind the LSTMs.
     ``encoder`` gives the layer sizes of an encoder in front of each LSTM, see ``EncodedLSTM``.
@@ -104,8 +105,9 @@ class FastRecurrentPolicy(RecurrentActorCriticPolicy):
         gait: GaitNoise | None = None,
         **kwargs: Any,
     ) -> None:
-        # Fused: one operation instead of a dozen for each parameter.
-        kwargs.setdefault("optimizer_kwargs", {"fused": True})
+        # Fused: one operation instead of a dozen for each parameter. SB3's ``eps`` of 1e-5 would
+        # drown small gradients (docs/experiments.md).
+        kwargs.setdefault("optimizer_kwargs", {"fused": True, "eps": 1e-8})
         self.mirror, self.gait, self.gait_bonus = mirror, gait, 0.0
         self.encoder_arch = tuple(encoder)
         if encoder and lstm_hidden_size is None:
@@ -377,9 +379,9 @@ class FastRecurrentPPO(RecurrentPPO):
             it falls linearly to zero at the last. It requires an ``ent_coef`` above 0.
         exchange: exchange of hidden states after each rollout; None for no exchange.
         desired_kl: KL divergence of the policy after an update from that before; the actor's
-            learning rate is a share of ``learning_rate`` that keeps it at or below this, see
-            ``adapted_share``. None: the actor learns at ``learning_rate``, as the critic always
-            does.
+            learning rate is a share of ``learning_rate``, lowered after an update beyond twice
+            this, see ``adapted_share``. None: the actor learns at ``learning_rate``, as the critic
+            always does.
 
     Raises:
         ValueError: ``batch_size`` is below ``n_steps``, too small for one environment's rollout.

@@ -207,6 +207,7 @@ class Run:
                 finished = learn(model, callback, phase.until)
             except WorkerError:
                 callback.tell_faults()
+                callback.log()
                 callback.save()
                 raise
             # A phase's policy is kept beside those of later phases.
@@ -318,15 +319,15 @@ class RunCallback(BaseCallback):
         return taken
 
     def log(self) -> None:
-        """Write a log row about the steps since the last row, if there are any."""
+        """Write a log row about the steps since the last row, if there are steps or faults."""
         steps, seconds = self._logged_at
-        if steps == self.num_timesteps:
+        if steps == self.num_timesteps and not self._faults:
             return
         sums: dict[str, float] = {}
         for part in self.env.stats():
             for key, value in part.items():
                 sums[key] = sums.get(key, 0.0) + value
-        values = self.run.summarise(sums)
+        values = self.run.summarise(sums) if sums else {}  # if all workers are broken
         values["time/steps_per_s"] = (self.num_timesteps - steps) / (self.seconds - seconds)
         episodes = self.model.ep_info_buffer or ()
         if episodes:
@@ -444,7 +445,8 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
             updated_at = model.num_timesteps
         callback.log()
     except WorkerError:
-        model.num_timesteps = updated_at  # nothing was learned from the steps since
+        # Nothing was learned from the steps since.
+        model.num_timesteps = callback.num_timesteps = updated_at
         raise
     finally:
         callback.on_training_end()

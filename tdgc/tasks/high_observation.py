@@ -192,7 +192,7 @@ def high_mirror(config: HighLevelConfig) -> Mirror:
     Raises:
         ConfigError: probes or command bounds that are not left-right symmetric.
     """
-    if config.probes == "staggered":
+    if config.probes == "staggered" and config.cues in ("both", "geometric"):
         raise ConfigError(
             f"probes that are {config.probes} are not the same on both sides, as a symmetric "
             "policy needs them; ppo.mirror=false does without symmetry"

@@ -120,7 +120,7 @@ class LowLevelTask:
             self.locomotion.randomise(index, self.config.randomisation, self.rng)
             self.pushes.schedule(index, self.episodes.elapsed)
         self._draw_commands(index)
-        # Start at the commanded heading, so that the first command needs no turn on the spot.
+        # Start near the commanded heading, so that the first command needs no turn on the spot.
         yaw = yaw + np.where(self.episodes.crossing[index], self.episodes.facing[index], 0.0)
         self.locomotion.place(index, xy, yaw, self.rng.uniform(size=len(index)))
         self.ground = measure_ground(self.locomotion)

@@ -114,15 +114,17 @@ class Skill:
 #: m before a trench at which leaps begin, since the probes, which reach 1.2 m, show it there.
 SIGHT = 1.15
 
-# Weight of a newly seen speed in the estimate, chosen by hand: it oscillates within a gait cycle.
-_SEEN = 0.5
+# s after which a speed that was seen counts for half in the estimate, chosen by hand: speeds
+# oscillate within a gait cycle.
+_HALF_LIFE = 0.1
 _RAYS = np.linspace(-np.pi, np.pi, 24, endpoint=False)  # directions that are compared, 15 degrees
-_APART = 0.9  # rad, least angle between two ways whose mean would lead into the obstacle
+# rad, least angle between two ways whose mean would lead into the obstacle; chosen by hand.
+_APART = 0.9
 #: Commands in which the two ways around an obstacle differ.
 WAY = [INDEX[name] for name in VELOCITIES]
 
 
-_DISTANCE_GAIN = 1.0  # 1/s: a robot slows down where it could arrive within a second
+_DISTANCE_GAIN = 1.0  # 1/s, by hand: a robot slows down where it could arrive within a second
 
 
 def toward(
@@ -151,7 +153,7 @@ class Teacher:
 
     Args:
         field: M tiles.
-        ranges: command ranges that the low policy was trained on.
+        ranges: of the commands that it may give.
         skill: of the low policy.
 
     Attributes:
@@ -170,7 +172,7 @@ class Teacher:
         self._field, self._ranges, self._landing = field, ranges, skill.landing
         self._origin = field.origin(np.arange(m))
         commands = np.array([style.command() for style in (skill.uneven, SLOPING, LEAPING)])
-        # The low policy may have been trained on narrower ranges than the styles use.
+        # The ranges may be narrower than the styles use.
         self._uneven, self._sloping, self._leap = CommandDecoder(ranges).nearest(commands)
         self.speed = np.zeros(m)
         self.price = np.zeros((m, FREQUENCIES, LENGTHS))
@@ -210,7 +212,8 @@ class Teacher:
     def watch(self, loco: Locomotion, seconds: float) -> None:
         """Update the speed estimates; to be called once per decision of ``seconds``."""
         _, self.speed = speed_up(self.speed, self._leap_speed, seconds)
-        self.speed += _SEEN * (loco.world.state.heading_vel[:, 0] - self.speed)
+        seen = 1.0 - 0.5 ** (seconds / _HALF_LIFE)
+        self.speed += seen * (loco.world.state.heading_vel[:, 0] - self.speed)
 
     def commands(self, loco: Locomotion, goal: Array) -> Array:
         """Commands (M, 15) for the coming decision; ``goal`` (M, 2) m in the world."""
