@@ -52,7 +52,7 @@ from tdgc.show import film, gui, plots, report
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.geometry import read_geometry
 from tdgc.tasks.leaps import measure_landing
-from tdgc.tasks.manners import find_manner, manner_of
+from tdgc.tasks.manners import find_manner, manner_of, within
 from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of
 from tdgc.tasks.teacher import Skill
 
@@ -250,7 +250,7 @@ class Evaluation:
             high, _ = load_high(self.high, low, config)
         except ConfigError as error:
             print(f"{error}: trying out how the low policy walks and leaps best")
-            manner = find_manner(low, HighLevelConfig(), print)
+            manner = within(find_manner(low, HighLevelConfig(), print), config.commands)
         else:
             manner = manner_of(high, self.high)
         landing = measure_landing(low, config, manner.leap_speed)
@@ -374,10 +374,6 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
             behaviours += ran.behaviours
             bar.update(len(ran.episodes))
     print(describe(write_results(out, episodes, trained_on)))
-    plots.success_by_level(out / "summary.json", out / "success.png")
-    plots.gait_shares(out, out / "gaits.png")
-    plots.headings(out, out / "headings.png")
-    plots.trajectories(out, out / "trajectories.png")
     if e.traced is not None:
         diagnosis.write(diagnoses, out / "diagnosis.csv")
         print(f"\n{diagnosis.describe(diagnoses, episodes)}")
@@ -388,6 +384,11 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
         result = {"tuning": tuning.record(e.tuning), "effect": effect}
         write_json(out / "tuning.json", result)
         print_effect(effect)
+    # Only now, as figures can be drawn again from the files.
+    plots.success_by_level(out / "summary.json", out / "success.png")
+    plots.gait_shares(out, out / "gaits.png")
+    plots.headings(out, out / "headings.png")
+    plots.trajectories(out, out / "trajectories.png")
     print(f"\ntables and figures are in {out}")
     painters = e.workers if e.cluster is None else usable_cores()
     problems = film.produce(recordings, out / "films", painters) if recordings else []

@@ -145,12 +145,8 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
     return Pair(low_policy, low_config, high_policy, high_config)
 
 
-def interfaces(pair: Pair, low: LowGraph, high: HighGraph, urdf: Path) -> dict[str, Table]:
-    """Contents of the two interface files by graph, except ``files``.
-
-    Their schema is ``tdgc/deploy/interface.schema.json``; ``urdf`` is the exported folder's copy.
-    """
-    return {"low": _low_table(pair, low, urdf), "high": _high_table(pair, high)}
+# Contents of the two interface files, except ``files``. Their schema is
+# ``tdgc/deploy/interface.schema.json``; ``urdf`` is the exported folder's copy.
 
 
 def _low_table(pair: Pair, graph: LowGraph, urdf: Path) -> Table:
@@ -317,12 +313,15 @@ def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
     low = LowGraph(pair.low, pair.low_config)
     high = HighGraph(pair.high, pair.high_config, pair.low_config)
     urdf = _copy_robot(pair.low_config.robot, folder)
-    tables = interfaces(pair, low, high, urdf)
-    for name, graph in (("low", low), ("high", high)):
+    tables = {"low": _low_table(pair, low, urdf), "high": _high_table(pair, high)}
+    graphs: dict[str, LowGraph | HighGraph] = {"low": low, "high": high}
+    for name in graphs:  # first, so that none is left beside a new one of the other policy
+        for suffix in FORMATS.values():
+            (folder / (name + suffix)).unlink(missing_ok=True)
+    for name, graph in graphs.items():
         files = {}
         for form, suffix in FORMATS.items():
             path = folder / (name + suffix)
-            path.unlink(missing_ok=True)
             if form in formats:
                 _write_graph(graph, path)
                 files[form] = _file(path)

@@ -247,7 +247,7 @@ def test_films_are_named_as_recordings_are() -> None:
         "policy": "gp", "condition": "pushes", "family": "my/hills.npy", "level": "8",
         "episode": "12", "seed": "0", "outcome": "fell",
     }  # fmt: skip
-    assert report.film_stem(row) == "gp_pushes_my-hills.npy_08_012"
+    assert report.record_of(row).name == "gp_pushes_my-hills.npy_08_012"
 
 
 def test_every_condition_but_nominal_changes_something_of_its_own() -> None:

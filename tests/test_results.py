@@ -41,7 +41,8 @@ def test_room_is_made_in_a_used_folder(tmp_path: Path) -> None:
     for name in ("films/mine", "films/own.txt", "notes.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("") if "." in name else (tmp_path / name).mkdir()
-    for name in (*FILES, "films/film_gp_stair_06_000.gif", "settings.json"):
+    stopped = "films/.film_gp_stair_06_001.mp4.4711.tmp"
+    for name in (*FILES, "films/film_gp_stair_06_000.gif", stopped, "settings.json"):
         (tmp_path / name).write_text("")
     make_room(tmp_path, ["settings.json"], {"logs": True, "traces": False})
     left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))

@@ -30,8 +30,8 @@ from tdgc.tasks.leaps import (
 from tdgc.tasks.probes import PROBE_RANGE, PROBES
 from tdgc.tasks.teacher import LEAPING, SLOPING, Skill, Style, toward
 
-#: How to walk where the family is unknown: a compromise for rough ground, stairs and slopes, with
-#: any low policy.
+#: How to walk where the family is unknown: a compromise, chosen by hand, for rough ground, stairs
+#: and slopes, with any low policy.
 UNKNOWN = Style(0.6, frequency=3.2, swing_height=0.2, stance_width=0.33, uphill=0.45)
 
 # m, clearance that a foothold should keep from a lip, whose position is known to about 5 cm. Of 20

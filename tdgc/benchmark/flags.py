@@ -1,12 +1,13 @@
 """Flags shared by the evaluations in all simulators: episodes, workers and results folder."""
 
 import argparse
+import itertools
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.sim.families import ALL_FAMILIES, FAMILIES, OOD_LEVELS
-from tdgc.sim.terrain import MAP_ENDING, height_map, is_map
+from tdgc.sim.terrain import MAP_ENDING, file_label, height_map, is_map
 
 Group: TypeAlias = argparse._ArgumentGroup
 
@@ -70,6 +71,9 @@ def resolve(args: argparse.Namespace) -> None:
     args.families = choose(families, (*ALL_FAMILIES, *maps), FAMILIES, "family")
     for name in maps:
         height_map(name)
+    for one, other in itertools.combinations(maps, 2):
+        if file_label(one) == file_label(other):
+            raise ValueError(f"files of '{one}' and '{other}' would have the same names")
     args.workers = usable_cores() if args.workers == "auto" else args.workers
     for flag, value in (("--episodes", args.episodes), ("--workers", args.workers)):
         if value < 1:

@@ -52,7 +52,7 @@ EPISODES = 4  # per fault and family
 LEVELS = dict.fromkeys(FAMILIES, 6) | {"rough": 4}
 LIMIT_SEEDS, LIMIT_LEVELS, LIMIT_EPISODES = (1, 2), (6, 8), 5
 _SHARE = 95  # per cent of the errors in successful episodes that stay below a limit
-_WEAK = 0.02  # share of its strength that a weak motor has left
+_WEAK = 0.02  # share of its strength that a weak motor has left, chosen by hand
 
 
 class WeakMotor(HierarchyDriver):

@@ -21,7 +21,8 @@ from tdgc.sim.terrain import EDITION
 
 #: Files written by ``write_results``.
 FILES = ("episodes.csv", "summary.json", "trajectories.npz")
-_FILMS = ("films/film_*", "films/sheet_*", "films/strip_*")
+# The last are of painters that were stopped.
+_FILMS = ("films/film_*", "films/sheet_*", "films/strip_*", "films/.*.tmp")
 #: Keys of summary.json beside the policies: "tdgc - gp" -> ``compare``; policy -> ``sides``; the
 #: benchmark editions of the tiles and of the policies' training; and ``Training.robot``.
 PAIRED, SIDES, EDITIONS, ROBOT = "paired", "sides", "editions", "robot"

@@ -68,8 +68,8 @@ def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, fl
     """Measure tracking in one gait on the plane, with commands over the full ranges.
 
     Returns the RMSE of the instantaneous planar velocity (heading frame) and of the yaw rate at
-    every control step after the first second, and the share of foot samples in which contact is as
-    desired.
+    every control step after the first second but the last, and the share of foot samples in which
+    contact is as desired.
     """
     config, g = mdp_of(low), GAITS.index(gait)
     rng = np.random.default_rng((EVAL_STREAM, seed, g))

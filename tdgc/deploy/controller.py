@@ -61,14 +61,20 @@ class Graph:
         """Begin a new episode."""
         self.memory, self.values, self.seconds = dict(self._start), dict[str, Array](), 0.0
 
-    def check(self, readings: dict[str, Array]) -> None:
+    def check(self, readings: dict[str, Array], only: str | None = None) -> None:
         """Check that the readings which the graph takes are there, of the right shape and finite.
+
+        Args:
+            readings: by name.
+            only: name of the one to check; None for all.
 
         Raises:
             ExportError: one is not; ``memory`` would be wrong from then on.
         """
         for signal in self.table["inputs"]:
             name, shape = signal["name"], tuple(signal["shape"])
+            if only not in (None, name):
+                continue
             if name not in readings:
                 if name in self.memory or signal["source"] is not None:
                     continue
@@ -320,9 +326,11 @@ class Controller:
         if "goal" not in readings:  # also where ``high`` is not due
             raise ExportError("the reading 'goal' is missing")
         readings = readings | {"time_left": np.array([task["horizon"]["value"] - elapsed])}
-        if np.linalg.norm(readings["goal"]) < task["goal_radius"]["value"]:
-            self._reached_at = self.count if self._reached_at is None else self._reached_at
-        over = self.over(self.count, self._reached_at)
+        self.high.check(readings, "goal")
+        reached_at, near = self._reached_at, task["goal_radius"]["value"]
+        if reached_at is None and np.linalg.norm(readings["goal"]) < near:
+            reached_at = self.count
+        over = self.over(self.count, reached_at)
         due = [
             name
             for name, every in self._order
@@ -330,6 +338,7 @@ class Controller:
         ]
         for name in due:
             self._graphs[name].check(readings)
+        self._reached_at = reached_at
         self.decided, self.seconds = False, 0.0
         for name in due:
             graph = self._graphs[name]

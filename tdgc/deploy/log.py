@@ -28,6 +28,7 @@ from tdgc.benchmark.trace import (
 )
 from tdgc.deploy.controller import Controller
 from tdgc.errors import InputError
+from tdgc.files import atomic
 from tdgc.sim.commands import INDEX
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.terrain import file_label
@@ -115,7 +116,7 @@ class LogWriter:
         self._rows.append(whole | {"time": np.array(step * self._controller.dt)})
 
     def save(self, path: Path) -> None:
-        """Write all rows to an ``.npz`` file.
+        """Write all rows to an ``.npz`` file, atomically.
 
         Raises:
             OSError: the file cannot be written.
@@ -124,7 +125,9 @@ class LogWriter:
         for name in OPTIONAL:
             if np.isnan(columns[name]).all():  # never given
                 del columns[name]
-        np.savez_compressed(path, allow_pickle=False, **columns)
+        # Pass an open file, because NumPy would append its suffix to a name.
+        with atomic(path) as partial, open(partial, "wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **columns)
 
 
 # ---------------------------------------------------------------------------- reading

@@ -363,7 +363,7 @@ def _produce(job: _Job, folder: Path, mp4: bool) -> str | None:
         else:
             sheet(recordings[0], folder / f"sheet_{recordings[0].name}.png")
             film(recordings[0], folder, mp4)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # PyAV's, for an encoder that it lacks, is the latter
         return f"no {kind} of {recordings[0].name}: {error}"
     return None
 

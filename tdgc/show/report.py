@@ -146,16 +146,11 @@ def record_of(row: Row) -> EpisodeRecord:
     return EpisodeRecord(*where, level, episode, seed, row["outcome"])
 
 
-def film_stem(row: Row) -> str:
-    """Name of the films for a row of episodes.csv or diagnosis.csv."""
-    return record_of(row).name
-
-
 def _film(folder: Path, row: Row, diagnosis: Row | None, room: int) -> dict[str, Any]:
     """Describe an episode: its rows of episodes.csv and diagnosis.csv, the name of its film in
     ``folder``, and film and sheet as data URIs, the film's only if it fits in ``room`` bytes;
     None for what is missing."""
-    stem = film_stem(row)
+    stem = record_of(row).name
     kinds = (folder / f"film_{stem}.mp4", folder / f"film_{stem}.gif")
     path = next((path for path in kinds if path.is_file()), None)
     sheet = folder / f"sheet_{stem}.png"
@@ -176,7 +171,7 @@ def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> l
         episodes: those that were filmed.
         diagnoses: of any episodes.
     """
-    causes = {film_stem(d): d for d in diagnoses}
+    causes = {record_of(d).name: d for d in diagnoses}
     room = FILM_BYTES
     tiles = []
     for family in _distinct(episodes, "family"):
@@ -185,7 +180,7 @@ def _tiles(folder: Path, episodes: Sequence[Row], diagnoses: Sequence[Row]) -> l
         films = []
         for row in episodes:
             if [row[key] for key in _TILE] == where:
-                film = _film(folder, row, causes.get(film_stem(row)), room)
+                film = _film(folder, row, causes.get(record_of(row).name), room)
                 films.append(film)
                 if film["uri"]:
                     room -= (folder / film["file"]).stat().st_size
@@ -209,7 +204,7 @@ def render(folder: Path) -> str:
     has_diagnoses = (folder / "diagnosis.csv").is_file()
     diagnoses = _rows(folder / "diagnosis.csv") if has_diagnoses else []
     films = folder / "films"
-    filmed = [r for r in episodes if any(films.glob(f"*_{glob.escape(film_stem(r))}.*"))]
+    filmed = [r for r in episodes if any(films.glob(f"[!.]*_{glob.escape(record_of(r).name)}.*"))]
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
