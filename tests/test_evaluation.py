@@ -418,6 +418,15 @@ def test_a_cluster_without_cpus_is_refused(monkeypatch, capsys):
     assert capsys.readouterr().err == said
 
 
+def test_two_maps_whose_files_would_have_the_same_names(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("my map.npy", "my-map.npy"):
+        np.save(name, np.zeros((161, 161)))
+    assert evaluate.main(["--policies", "gp", "--families", "my map.npy,my-map.npy"]) == 2
+    said = "files of 'my map.npy' and 'my-map.npy' would have the same names"
+    assert capsys.readouterr().err == f"evaluate.py: {said}\n"
+
+
 def test_a_policy_of_the_wrong_kind(high, capsys):
     assert evaluate.main(["--low", str(high)]) == 2
     assert capsys.readouterr().err.endswith("high: not a low policy of this package\n")

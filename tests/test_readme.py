@@ -473,6 +473,14 @@ def test_what_is_named_is_there(name: str) -> None:
     assert not missing
 
 
+@pytest.mark.parametrize("name", TEXT)
+def test_rows_are_as_wide_as_their_table(name: str) -> None:
+    prose = re.sub(r"^```.*?^```$", "", TEXT[name], flags=re.MULTILINE | re.DOTALL)
+    for table in re.findall(r"(?:^\|.*\n)+", prose, flags=re.MULTILINE):
+        header, *rows = [line.replace("\\|", "").count("|") for line in table.splitlines()]
+        assert rows == [header] * len(rows), table
+
+
 def test_extras_are_in_setup() -> None:
     setup = configparser.ConfigParser()
     setup.read(ROOT / "setup.cfg", encoding="utf-8")

@@ -91,6 +91,7 @@ class Blindfold(HierarchyDriver):
 
     def _observe(self, decision: int) -> Any:
         seen = super()._observe(decision)
+        self.probes = None
         probes = columns(high_layout(self.config)).get("probes")
         if probes is not None:
             seen[:, probes] = 0.0

@@ -352,13 +352,13 @@ def _high_inputs(seconds: float) -> list[Signal]:
         "by yaw alone"
     )
     clock = "the low policy's in its coming step"
-    raw, last = "the last decision, not clipped", "those of the last decision"
+    last = "those of the last decision"
     start = tuple(default_command().tolist())
     return [
         Signal("goal", 2, "m", goal),
         Signal("time_left", 1, "s", f"left of the episode's {seconds:g} s"),
         *_BODY,
-        Signal("last_decision", NUM_ACTIONS, "1", raw, "decision", "decision", 0.0),
+        Signal("last_decision", NUM_ACTIONS, "1", "the last one", "decision", "decision", 0.0),
         Signal("last_commands", NUM_COMMANDS, None, last, "commands", "commands", start),
         Signal("clock", 1, "1", clock, start=0.0, source="low.next_clock"),
     ]
@@ -405,7 +405,7 @@ class HighGraph(nn.Module):
         self.seconds, self.step = _constant(seconds), _constant(step)
         self.ahead = _constant([1.0, 0.0])
         state = {"hidden": "state of the LSTM", "cell": "cell of the LSTM"}
-        raw = "raw actions, before clipping and decoding"
+        actions = "the policy's actions, clipped but not decoded"
         size = policy.state_size
         self.inputs = [
             *_high_inputs(seconds),
@@ -413,7 +413,7 @@ class HighGraph(nn.Module):
             *(Signal(k, size, "1", what, None, f"next_{k}", 0.0) for k, what in state.items()),
         ]
         self.outputs = [
-            Signal("decision", NUM_ACTIONS, "1", raw, "decision"),
+            Signal("decision", NUM_ACTIONS, "1", actions, "decision"),
             Signal("commands", NUM_COMMANDS, None, "for the low policy", "commands"),
             *(Signal(f"next_{k}", size, "1", what) for k, what in state.items()),
         ]
