@@ -50,13 +50,13 @@ from tdgc.sim.terrain import EDITION
 from tdgc.tasks.curriculum import check_rules
 from tdgc.tasks.high_env import NavigationTask
 from tdgc.tasks.high_observation import high_mirror, high_spaces, untold_column
-from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.manners import find_manner, manner_of, may_leap, within
 from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of, paired
 from tdgc.tasks.rules import episode_steps
+from tdgc.tasks.statistics import summarise_high
 from tdgc.tasks.teacher import Skill
-from tdgc.tasks.tiles import check_families, check_levels, left_out
+from tdgc.tasks.tiles import check_tiles, left_out
 
 # Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
 # the apprentice alone drives, so that it learns in the states to which its own actions lead. Chosen
@@ -300,9 +300,8 @@ def check(config: HighTrainConfig, control_dt: float) -> None:
         ValueError: names the setting and what is allowed.
     """
     env, ppo = config.env, config.ppo
-    check_families(env.families)
-    check_levels(env.levels)
-    check_rules(env.window, env.threshold, env.levels)
+    check_tiles(env.families, env.levels)
+    check_rules(env.window, env.threshold)
     if env.first_level + env.first_levels > env.levels:
         raise ConfigError(
             f"'env.first_level' and 'env.first_levels' must add up to at most {env.levels} levels, "
@@ -401,7 +400,7 @@ def main(arguments: list[str] | None = None) -> int:
     }
     if config.imitation.teacher is not None:
         meta["teacher"] = to_dict(config.imitation.teacher)
-    run = Run(args.out, config, meta, summarise, interruption, args.init)
+    run = Run(args.out, config, meta, summarise_high, interruption, args.init)
     run.train(phases(config, low, Machine.of(args)), args.resume)
     log = args.out / "log.jsonl"
     if log.exists():

@@ -44,9 +44,9 @@ from tdgc.sim.robot import fitted
 from tdgc.sim.terrain import EDITION
 from tdgc.tasks.low_env import make_task
 from tdgc.tasks.low_observation import low_mirror, low_spaces
-from tdgc.tasks.low_statistics import summarise
 from tdgc.tasks.rules import episode_steps
-from tdgc.tasks.tiles import check_families, check_levels, left_out
+from tdgc.tasks.statistics import summarise_low
+from tdgc.tasks.tiles import check_tiles, left_out
 
 
 def phases(config: LowTrainConfig, machine: Machine) -> list[Phase]:
@@ -85,8 +85,7 @@ def check(config: LowTrainConfig) -> None:
             f"'calibration.robots' must be 0 or at least {LEAST_ROBOTS}, "
             f"not {config.calibration.robots}"
         )
-    check_families(config.env.families)
-    check_levels(config.env.levels)
+    check_tiles(config.env.families, config.env.levels)
     check_robot(config.env.robot, config.env.physics, config.env.randomisation)
 
 
@@ -152,7 +151,7 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
 
         try:
             workers = min(config.workers, usable_cores())  # here, also after a run on a cluster
-            correction, facts = calibrate(learned, config.calibration, workers, config.seed, tick)
+            correction, facts = calibrate(learned, robots, workers, config.seed, tick)
         except StoppedError:
             interruption.tell(out)
             return
@@ -222,7 +221,7 @@ def main(arguments: list[str] | None = None) -> int:
     }
     make_folder(args.out)
     interruption = Interruption(args.time_limit)
-    run = Run(args.out, config, meta, summarise, interruption, args.init)
+    run = Run(args.out, config, meta, summarise_low, interruption, args.init)
     calibrating = functools.partial(finish, args.out, config, interruption)
     run.train(phases(config, Machine.of(args)), args.resume, calibrating)
     log = args.out / "log.jsonl"

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from torch import nn
 
 from tdgc import policies
@@ -32,7 +31,7 @@ from tdgc.parallel.cores import usable_cores, workers_flag
 from tdgc.parallel.jobs import run_jobs
 from tdgc.policies import Correction, Policy
 from tdgc.policies.files import files_of
-from tdgc.sim.commands import NAMES, NUM_COMMANDS, SIDEWAYS, command_bounds
+from tdgc.sim.commands import NAMES, NUM_COMMANDS, SIDEWAYS, CommandDecoder, command_bounds
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.robot import Array
 from tdgc.tasks.pairing import load_low, mdp_of
@@ -91,10 +90,6 @@ def measure(low: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     return command[up], total[up] / steps
 
 
-def _float32(x: NDArray[np.floating]) -> th.Tensor:
-    return th.from_numpy(x.astype(np.float32))
-
-
 def _network(seed: int) -> nn.Sequential:
     """Network from commands, as ``ResponseModel.scaled`` gives them, to scaled velocity offsets."""
     sizes = (NUM_COMMANDS, *_HIDDEN)
@@ -117,11 +112,10 @@ class ResponseModel:
 
     def __init__(self, given: Array, reached: Array, ranges: CommandRanges, seed: int) -> None:
         self.ranges = ranges
-        bounds = command_bounds(ranges)
-        width = np.diff(bounds)[:, 0]
-        half = 0.5 * np.where(width > 0.0, width, 2.0)
-        self.zero = th.from_numpy(np.concatenate([bounds.mean(axis=1), np.full(3, 0.25)]))
-        self.unit = th.from_numpy(np.concatenate([half, np.full(3, 0.25)]))
+        decoder = CommandDecoder(ranges)
+        width = decoder.high - decoder.low
+        self.zero = th.from_numpy(0.5 * (decoder.low + decoder.high))
+        self.unit = th.from_numpy(0.5 * np.where(width > 0.0, width, 2.0))
         self._networks = [_network(3 * seed + k) for k in range(_NETWORKS)]
         self.error = self._fit(given, reached, np.random.default_rng(seed))
 
@@ -148,7 +142,8 @@ class ResponseModel:
         sign = np.array([np.ones(NUM_COMMANDS), _SIGN])[:, None]
         command = (sign * given[~held]).reshape(-1, NUM_COMMANDS)
         lack = (sign[..., :3] * (reached - given[:, :3])[~held]).reshape(-1, 3)
-        x, y = self.scaled(th.from_numpy(command)), _float32(lack / self.unit[:3].numpy())
+        x = self.scaled(th.from_numpy(command))
+        y = (th.from_numpy(lack) / self.unit[:3]).float()
         for network in self._networks:
             optimiser = th.optim.AdamW(network.parameters(), lr=2e-3)
             rate = th.optim.lr_scheduler.CosineAnnealingLR(optimiser, _EPOCHS)
@@ -202,7 +197,7 @@ def learn_correction(response: ResponseModel, seed: int) -> Correction:
 
 def calibrate(
     low: Policy,
-    calibration: CalibrationConfig,
+    robots: int,
     workers: int,
     seed: int,
     tick: Callable[[float], None] = lambda share: None,
@@ -211,7 +206,7 @@ def calibrate(
 
     Args:
         low: the policy to calibrate.
-        calibration: number of robots.
+        robots: number of them that walk.
         workers: processes in which the robots walk.
         seed: of everything random here.
         tick: called now and then with the share of the work done; what it raises ends the work.
@@ -224,7 +219,6 @@ def calibrate(
         WorkerError: a worker failed.
     """
     config = mdp_of(low)
-    robots = calibration.robots
     counts = [min(_BATCH, robots - first) for first in range(0, robots, _BATCH)]
     jobs = [
         functools.partial(measure, low, count, seed * len(counts) + k)
@@ -268,11 +262,10 @@ def main(arguments: list[str] | None = None) -> int:
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=42, help="random seed (42)")
     args = parser.parse_args(arguments)
-    for name, least in (("robots", LEAST_ROBOTS), ("seed", 0)):
+    args.workers = usable_cores() if args.workers == "auto" else args.workers
+    for name, least in (("robots", LEAST_ROBOTS), ("seed", 0), ("workers", 1)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be {least} or more, not {getattr(args, name)}")
-    if args.workers != "auto" and args.workers < 1:
-        raise ValueError(f"--workers must be 1 or more, not {args.workers}")
     low = load_low(args.low)[0]
     if low.meta.get("calibration", {}).get("robots"):
         raise ValueError(
@@ -282,8 +275,7 @@ def main(arguments: list[str] | None = None) -> int:
     if files_of(args.out)[0].absolute() == files_of(args.low)[0].absolute():
         raise ValueError(f"--out would replace --low, {args.low}; give another path")
     make_folder(args.out.parent)
-    workers = usable_cores() if args.workers == "auto" else args.workers
-    correction, facts = calibrate(low, CalibrationConfig(args.robots), workers, args.seed)
+    correction, facts = calibrate(low, args.robots, args.workers, args.seed)
     policies.save_copy(args.out, low, {**low.meta, "calibration": facts}, correction)
     print(
         f"{facts['walked']:.0f} of {args.robots} robots walked; the fit predicts what commands "

@@ -11,7 +11,7 @@ from tdgc.learn.flags import Machine
 from tdgc.parallel.group import TaskGroup
 from tdgc.parallel.worker import ProcessLink
 from tdgc.tasks.low_env import LowLevelTask, make_task
-from tdgc.tasks.low_statistics import summarise
+from tdgc.tasks.statistics import summarise_low
 
 PLANE = LowLevelConfig(physics=PhysicsConfig(substeps=4), episode_seconds=0.4)
 MACHINE = Machine("cpu", 1.0, ProcessLink)
@@ -64,7 +64,7 @@ def test_each_does_what_it_does_alone() -> None:
     sums, one, other = group.take_stats(), plane.take_stats(), tiles.take_stats()
     assert sums["steps"] == 150 and sums["robots"] == 5
     assert sums["term/track_lin_vel"] == one["term/track_lin_vel"] + other["term/track_lin_vel"]
-    assert summarise(sums)["level/stair"] == summarise(other)["level/stair"]
+    assert summarise_low(sums)["level/stair"] == summarise_low(other)["level/stair"]
     for task in (plane, tiles, group):
         task.close()
 
@@ -72,7 +72,7 @@ def test_each_does_what_it_does_alone() -> None:
 def test_command_share_is_the_mean_over_robots() -> None:
     group = TaskGroup(make())
     group.tasks[0].commands.share[:], group.tasks[1].commands.share[:] = 0.5, 1.0
-    assert summarise(group.take_stats())["command_share/pace"] == pytest.approx(0.8)
+    assert summarise_low(group.take_stats())["command_share/pace"] == pytest.approx(0.8)
     group.close()
 
 

@@ -41,11 +41,11 @@ from tdgc.tasks.high_observation import (
     untold_column,
 )
 from tdgc.tasks.high_rewards import HighStep
-from tdgc.tasks.high_statistics import summarise
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.pairing import PRETRAINED, load_low, paired
 from tdgc.tasks.probes import PROBE_RANGE, PROBES, height_probes
 from tdgc.tasks.rules import FELL, REACHED
+from tdgc.tasks.statistics import summarise_high
 from tdgc.tasks.teacher import WAY, Skill
 
 LOW = PRETRAINED / "low"
@@ -752,13 +752,20 @@ def test_disturbances_widen_with_the_level():
     task.close()
 
 
-def test_success_is_the_share_of_episodes_that_reached_the_goal():
-    config = dataclasses.replace(CONFIG, families=("stair", "tilt"))
-    task = NavigationTask(config, LOW_POLICY, 1, seed=3, training=False)
-    task.reset(np.arange(1))
-    task.step(np.zeros((1, 13)))
-    stats = task.take_stats()
+def test_success_is_of_the_episodes_that_the_policy_drove():
+    config = dataclasses.replace(CONFIG, families=("tilt",))
+    task = NavigationTask(config, LOW_POLICY, 4, seed=3, training=False)
+    task.reset(np.arange(4))
+    task.elapsed[:] = task.horizon - 1
+    task.goal[:2] = task.locomotion.world.state.position[:2, :2]
+    task._led[1] = True  # reaches its goal, but the teacher drove it
+    task.step(np.zeros((4, 13)))
+    values = summarise_high(task.take_stats())
     task.close()
-    values = summarise(stats | {"family/stair/episodes": 4.0, "family/stair/reached": 1.0})
-    assert values["success/stair"] == 0.25
-    assert "level/stair" in values and "level/tilt" not in values  # no robot is on tilt
+    assert values["success/tilt"] == pytest.approx(1 / 3)
+    assert values["gait/tilt_pace"] == 1.0  # the gait of an action 0
+
+
+def test_nothing_is_logged_of_a_family_without_robots():
+    values = summarise_high({"family/stair/count": 0.0, "family/stair/level": 0.0})
+    assert set(values) == {"reward/total"}

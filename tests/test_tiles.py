@@ -1,21 +1,14 @@
 """Training tiles: when new ones are drawn, and that their numbers suffice to redraw them."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from tdgc.sim.terrain import make_tile, tile_rng
-from tdgc.sim.tile import Tile
-from tdgc.tasks.tiles import FLAT, TrainingTiles, check_families, left_out
+from tdgc.tasks.tiles import FLAT, TrainingTiles, check_tiles, left_out
 
 FAMILIES = ("stair", FLAT, "rough")
 ALL = np.arange(3)
 LEVELS = np.array([4, 5, 6])
-
-
-def raised(tile: Tile, level: int) -> Tile:
-    return dataclasses.replace(tile, heights=tile.heights + np.float32(0.01 * level))
 
 
 def heights(tiles: TrainingTiles, robot: int) -> np.ndarray:
@@ -23,16 +16,20 @@ def heights(tiles: TrainingTiles, robot: int) -> np.ndarray:
 
 
 def test_each_robot_has_a_tile_of_its_own() -> None:
-    tiles = TrainingTiles(FAMILIES, seed=9, alter=raised)
+    tiles = TrainingTiles(FAMILIES, seed=9)
     tiles.draw(ALL, LEVELS)
     for number, robot in enumerate((0, 2)):
         family, level = FAMILIES[robot], int(LEVELS[robot])
-        tile = raised(make_tile(family, level / 10, tile_rng(9, family, level, number)), level)
+        tile = make_tile(family, level / 10, tile_rng(9, family, level, number))
         np.testing.assert_array_equal(heights(tiles, robot), tile.heights[:, 40:121])
     assert (heights(tiles, 1) == 0.0).all() and tiles.drawn == 2
-    plain = TrainingTiles(FAMILIES, seed=9)
-    plain.draw(ALL, LEVELS)
-    np.testing.assert_allclose(heights(tiles, 0) - heights(plain, 0), 0.04, atol=1e-6)
+
+
+def test_trenches_may_be_shallower_on_low_levels() -> None:
+    for shallowest, depth in ((None, 0.6), (0.04, 0.18)):  # 0.04 + 0.5^2 (0.6 - 0.04)
+        tiles = TrainingTiles(("gap",), 9, shallowest)
+        tiles.draw(np.array([0]), np.array([5]))
+        assert heights(tiles, 0).min() == pytest.approx(-depth)
 
 
 def test_a_tile_serves_five_episodes_of_a_level() -> None:
@@ -74,6 +71,12 @@ def test_with_few_robots_families_are_left_out() -> None:
 
 
 def test_mixed_is_kept_for_evaluation() -> None:
-    check_families(("stair", "gap"))
+    check_tiles(("stair", "gap"), 11)
     with pytest.raises(ValueError, match="must not name 'mixed', which is kept for evaluation"):
-        check_families(("stair", "mixed"))
+        check_tiles(("stair", "mixed"), 11)
+
+
+@pytest.mark.parametrize("levels", [0, 12])
+def test_the_highest_levels_are_kept_for_evaluation(levels: int) -> None:
+    with pytest.raises(ValueError, match=f"must be from 1 to 11, not {levels}"):
+        check_tiles(("stair",), levels)

@@ -12,7 +12,7 @@ from tdgc.sim.robot import Array
 from tdgc.tasks.leaps import LONGEST
 
 _FALLS = 256  # latest falls of a task's robots: those of a few minutes of walking
-# The sums of ``low_statistics.by_gait`` that a gait is judged by; the first counts its samples.
+# The sums of ``statistics.by_gait`` that a gait is judged by; the first counts its samples.
 _JUDGED = ("steps", "track_lin_vel", "track_yaw_rate", "match")
 PRONK = GAITS.index("pronk")
 

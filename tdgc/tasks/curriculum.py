@@ -26,8 +26,8 @@ from tdgc.state import State, copies, fill
 Ints = NDArray[np.int64]
 
 
-def check_rules(window: int, threshold: int, max_level: int) -> None:
-    """Raise ``ValueError`` unless (window + 1) / 2 < threshold <= window and max_level >= 1.
+def check_rules(window: int, threshold: int) -> None:
+    """Raise ``ValueError`` unless (window + 1) / 2 < threshold <= window.
 
     With a lower threshold, the same count could both promote and demote, or every count would do
     one of the two; with a higher one, nothing would ever promote.
@@ -37,25 +37,6 @@ def check_rules(window: int, threshold: int, max_level: int) -> None:
             f"threshold must be above (window + 1) / 2 and at most window, "
             f"not {threshold} with a window of {window}"
         )
-    if max_level < 1:
-        raise ValueError(f"max_level is the number of levels, at least 1, not {max_level}")
-
-
-def update_level(
-    level: ArrayLike, successes: ArrayLike, window: int, threshold: int, max_level: int
-) -> Ints:
-    """Levels after the two rules of Sec. IV-C, for full windows that hold ``successes`` successes.
-
-    ``level``, in 0..max_level - 1, and ``successes`` have the same shape. ``window`` is W episodes,
-    ``threshold`` is S, and ``max_level`` is L_max, the number of levels.
-
-    Raises:
-        ValueError: invalid rules, see ``check_rules``.
-    """
-    check_rules(window, threshold, max_level)
-    count = np.asarray(successes)
-    up, down = count >= threshold, count < window - threshold + 1
-    return np.clip(np.asarray(level) + up - down, 0, max_level - 1)
 
 
 class Curriculum:
@@ -76,7 +57,7 @@ class Curriculum:
         Raises:
             ValueError: invalid rules, see ``check_rules``, or a start outside the levels.
         """
-        check_rules(window, threshold, max_level)
+        check_rules(window, threshold)
         self.window, self.threshold, self.max_level = window, threshold, max_level
         self.levels: Ints = np.broadcast_to(np.asarray(start, dtype=np.int64), n).copy()
         if n and not (0 <= self.levels.min() and self.levels.max() < max_level):
@@ -94,13 +75,9 @@ class Curriculum:
         self.outcomes[envs] = np.column_stack((self.outcomes[envs, 1:], successes))
         self.counts[envs] = np.minimum(self.counts[envs] + 1, self.window)
         full = envs[self.counts[envs] == self.window]
-        level = update_level(
-            self.levels[full],
-            self.outcomes[full].sum(axis=1),
-            self.window,
-            self.threshold,
-            self.max_level,
-        )
+        count = self.outcomes[full].sum(axis=1)
+        up, down = count >= self.threshold, count < self.window - self.threshold + 1
+        level = np.clip(self.levels[full] + up - down, 0, self.max_level - 1)
         moved = full[level != self.levels[full]]
         self.levels[full] = level
         self.outcomes[moved], self.counts[moved] = False, 0

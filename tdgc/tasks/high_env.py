@@ -4,7 +4,6 @@
 curriculum sets; ``NavigationEnv`` wraps it as a Gymnasium environment with one robot.
 """
 
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from tdgc.tasks.rules import REACHED, episode_steps, has_failed, outcome
 from tdgc.tasks.statistics import Sums
 from tdgc.tasks.task_env import TaskEnv
 from tdgc.tasks.teacher import WAY, Skill, Teacher
-from tdgc.tasks.tiles import TrainingTiles, check_families, check_levels, shallow
+from tdgc.tasks.tiles import TrainingTiles, check_tiles
 
 
 class NavigationTask:
@@ -84,11 +83,8 @@ class NavigationTask:
         if config.curriculum == "hardest":
             levels[:] = config.levels - 1
         self.curriculum = Curriculum(m, config.window, config.threshold, config.levels, levels)
-        alter = None
-        if training and config.shallowest_trench is not None:
-            alter = functools.partial(shallow, shallowest=config.shallowest_trench)
         families = [config.families[f] for f in self.family]
-        self.tiles = TrainingTiles(families, seed, alter)
+        self.tiles = TrainingTiles(families, seed, config.shallowest_trench if training else None)
         self.field = self.tiles.field
         self._build_robots()
         self._origin = self.field.origin(np.arange(m))
@@ -198,37 +194,34 @@ class NavigationTask:
         reward = np.sum(list(terms.values()), axis=0)
         held = reached & (self.elapsed - self._reached_at >= self._hold_decisions)
         truncated = ~failed & (held | (self.elapsed >= self.horizon))
-        done = np.flatnonzero(failed | truncated)
-        self._count(terms, reward, commands, done, reached)
+        # Episodes that the teacher drives do not rate the policy.
+        own = np.flatnonzero((failed | truncated) & ~self._led)
+        self._count(terms, reward, commands, own)
         if self.training:
-            own = done[~self._led[done]]  # episodes that the teacher drives do not rate the policy
             if own.size and c.curriculum == "performance":
                 self.curriculum.push(own, reached[own])
             self._pushes.push(loco.world, self.elapsed, self._width())
         return reward, failed, truncated
 
     def observe(self) -> NDArray[np.float32]:
-        """o^H, (M, n), followed by the guidance, (M, ``GUIDANCE``), if there is a teacher."""
+        """o^H, (M, n), followed by the guidance if there is a teacher: (M, ``GUIDANCE``), in the
+        order of ``GUIDANCE_PARTS``."""
         seen = self._observer.observe(
             self.goal, self.elapsed / self.horizon, self.rewards.actions[0], self.family_index
         )
-        if self.teacher is None:
+        teacher = self.teacher
+        if teacher is None:
             return seen
-        if np.isfinite(seen).all():
-            guidance = self._guidance(self.teacher)
-        else:  # a robot has blown up: the worker ends all of its episodes
-            guidance = np.zeros((self.num_robots, GUIDANCE))
+        guidance = np.zeros((self.num_robots, GUIDANCE))
+        if np.isfinite(seen).all():  # else a robot has blown up: the worker ends all episodes
+            commands = teacher.commands(self.locomotion, self.goal)
+            self._taught, other = (
+                self.decoder.encode(self.decoder.nearest(way)) for way in (commands, teacher.other)
+            )
+            aside = (other - self._taught)[:, WAY]
+            price = teacher.price.reshape(self.num_robots, -1)
+            guidance = np.column_stack([self._taught, aside, teacher.dearer, price])
         return np.concatenate([seen, guidance], axis=1, dtype=np.float32)
-
-    def _guidance(self, teacher: Teacher) -> Array:
-        """The teacher's guidance, (M, ``GUIDANCE``), in the order of ``GUIDANCE_PARTS``."""
-        commands = teacher.commands(self.locomotion, self.goal)
-        self._taught, other = (
-            self.decoder.encode(self.decoder.nearest(way)) for way in (commands, teacher.other)
-        )
-        aside = (other - self._taught)[:, WAY]
-        price = teacher.price.reshape(self.num_robots, -1)
-        return np.column_stack([self._taught, aside, teacher.dearer, price])
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -243,23 +236,17 @@ class NavigationTask:
     # ------------------------------------------------------------------ statistics, resume
 
     def _count(
-        self,
-        terms: dict[str, Array],
-        reward: Array,
-        commands: Array,
-        done: NDArray[np.integer],
-        reached: NDArray[np.bool_],
+        self, terms: dict[str, Array], reward: Array, commands: Array, own: NDArray[np.integer]
     ) -> None:
-        add = self.stats.add
+        add, gait = self.stats.add, gait_index(commands)
         self.stats.add_rewards(terms, reward)
-        gait = gait_index(commands)
         for col, family in enumerate(self.config.families):
             mine = self.family == col
-            ended = done[mine[done] & ~self._led[done]]
+            ended = own[mine[own]]
             add(f"family/{family}/count", mine.sum())
             add(f"family/{family}/level", self.curriculum.levels[mine].sum())
             add(f"family/{family}/episodes", ended.size)
-            add(f"family/{family}/reached", reached[ended].sum())
+            add(f"family/{family}/reached", self.reached[ended].sum())
             for g, name in enumerate(GAITS):
                 add(f"family/{family}/{name}", (gait[mine] == g).sum())
 
@@ -362,8 +349,7 @@ class NavigationEnv(TaskEnv):
         render_mode: str | None = None,
     ) -> None:
         self.config = config or HighLevelConfig()
-        check_families(self.config.families)
-        check_levels(self.config.levels)
+        check_tiles(self.config.families, self.config.levels)
         policy, _ = load_low(low)
         super().__init__(
             lambda seed, visual: NavigationTask(

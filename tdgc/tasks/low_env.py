@@ -4,7 +4,6 @@
 environment with one robot.
 """
 
-import functools
 import math
 from typing import Any
 
@@ -30,12 +29,11 @@ from tdgc.tasks.ground import measure_ground
 from tdgc.tasks.leaps import Landing
 from tdgc.tasks.low_observation import CRITIC_LAYOUT, CriticSources, low_spaces
 from tdgc.tasks.low_rewards import LowStep, low_terms, total
-from tdgc.tasks.low_statistics import by_gait
 from tdgc.tasks.pushes import Pushes
 from tdgc.tasks.rules import COLLIDED, FELL, LEFT_TILE, episode_steps, outcome
-from tdgc.tasks.statistics import Sums
+from tdgc.tasks.statistics import Sums, by_gait
 from tdgc.tasks.task_env import TaskEnv
-from tdgc.tasks.tiles import FLAT, TrainingTiles, check_families, check_levels, shallow
+from tdgc.tasks.tiles import FLAT, TrainingTiles, check_tiles
 
 _PLANE_SPACING = 5.0  # m between robots on the plane, so that few boxes overlap in the broad phase
 
@@ -84,8 +82,8 @@ class LowLevelTask:
         self.column = (first + np.arange(m)) % len(config.families)
         on_tiles = config.terrain == "tiles"
         families = [config.families[c] if on_tiles else FLAT for c in self.column]
-        alter = functools.partial(shallow, shallowest=config.crossing.shallowest_trench)
-        self.tiles = TrainingTiles(families, seed, alter) if on_tiles else None
+        shallowest = config.crossing.shallowest_trench
+        self.tiles = TrainingTiles(families, seed, shallowest) if on_tiles else None
         self.field = None if self.tiles is None else self.tiles.field
         # Longest gait cycle in control steps; tilts are kept for one step more, to interpolate.
         cycle = 1.0 / (config.commands.frequency[0] * config.physics.control_dt)
@@ -190,7 +188,9 @@ class LowLevelTask:
             # A failed retry is not remembered again: retried until they succeed, a few hopeless
             # commands would soon be the only ones left.
             self.commands.remember(loco.command[terminated & ~e.crossing & ~e.retried])
-            self._move_levels(terminated, terminated | truncated)
+            x = loco.world.state.position[:, 0] - e.origin[:, 0]
+            tried = terminated | (e.elapsed - e.began >= self.horizon)
+            self.level = self.crossings.move(self.level, x, terminated | truncated, tried)
         self._change_commands()
         if self.training:
             self.pushes.push(loco.world, e.elapsed, np.ones(self.num_robots))
@@ -205,12 +205,6 @@ class LowLevelTask:
                 self._draw_commands(due)
         everyone = np.arange(self.num_robots)
         self.crossings.steer(self.locomotion, self.ground, everyone)
-
-    def _move_levels(self, failed: NDArray[np.bool_], ended: NDArray[np.bool_]) -> None:
-        e = self.episodes
-        x = self.world.state.position[:, 0] - e.origin[:, 0]
-        tried = failed | (e.elapsed - e.began >= self.horizon)
-        self.level = self.crossings.move(self.level, x, ended, tried)
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -266,7 +260,7 @@ class LowLevelTask:
     # ------------------------------------------------------------------ statistics, resume
 
     def _count(self, terms: dict[str, Array], reward: Array, terminated: NDArray[np.bool_]) -> None:
-        """Add this step to ``stats``; see ``low_statistics.summarise`` for what is logged."""
+        """Add this step to ``stats``; see ``statistics.summarise_low`` for what is logged."""
         add = self.stats.add
         self.stats.add_rewards(terms, reward)
         add("minutes", self.num_robots * self.config.physics.control_dt / 60.0)
@@ -398,8 +392,7 @@ class LowLevelEnv(TaskEnv):
         self, config: LowLevelConfig | None = None, render_mode: str | None = None
     ) -> None:
         self.config = config or LowLevelConfig()
-        check_families(self.config.families)
-        check_levels(self.config.levels)
+        check_tiles(self.config.families, self.config.levels)
         super().__init__(
             lambda seed, visual: LowLevelTask(
                 self.config, 1, seed, visual=visual, first=seed % len(self.config.families)

@@ -3,27 +3,21 @@
 import dataclasses
 from pathlib import Path
 
-import numpy as np
-
 from tdgc import policies
-from tdgc.config import CommandRanges, ConfigError, HighLevelConfig, LowLevelConfig, recorded
+from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig, recorded
 from tdgc.policies import Policy
-from tdgc.sim.commands import CONTINUOUS, INDEX, NUM_COMMANDS, VELOCITIES, default_command
+from tdgc.sim.commands import (
+    CONTINUOUS,
+    INDEX,
+    NUM_COMMANDS,
+    VELOCITIES,
+    CommandDecoder,
+    default_command,
+)
 from tdgc.sim.robot import NUM_JOINTS
 
 #: Folder of the shipped policies.
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
-
-
-def at_default(ranges: CommandRanges) -> CommandRanges:
-    """Bounds that leave only the velocities free; the other commands are pinned at their defaults,
-    or at the nearest bound."""
-    default, pinned = default_command(), {}
-    for name in CONTINUOUS:
-        if name not in VELOCITIES:
-            value = float(np.clip(default[INDEX[name]], *getattr(ranges, name)))
-            pinned[name] = value, value
-    return dataclasses.replace(ranges, **pinned)
 
 
 def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
@@ -35,7 +29,10 @@ def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
     """
     ranges = high.commands or low.commands
     if high.behaviour == "velocities":
-        ranges = at_default(ranges)
+        # The other commands are pinned at their defaults, or at the nearest bound.
+        values = CommandDecoder(ranges).nearest(default_command()).tolist()
+        pinned = {x: (values[INDEX[x]],) * 2 for x in CONTINUOUS if x not in VELOCITIES}
+        ranges = dataclasses.replace(ranges, **pinned)
     for f in dataclasses.fields(low.commands):
         asked, trained = getattr(ranges, f.name), getattr(low.commands, f.name)
         if asked[0] < trained[0] or asked[1] > trained[1]:

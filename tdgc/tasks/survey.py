@@ -165,8 +165,8 @@ def lateral_slope(heights: Array, steps: Mask) -> Array:
     uneven = np.abs(heights - _mean(_mean(heights, 0, _NEAR), 1, _NEAR))
     for axis in (0, 1):
         uneven = _windows(uneven, axis, _FAR, mode="edge").max(axis=-1)
-    wide = _padded(heights, 1, _FAR, **_SLOPING_ON)
-    slope = _mean((wide[:, 2 * _FAR :] - wide[:, : -2 * _FAR]) / (2 * _FAR * CELL), 0, _FAR)
+    wide = _windows(heights, 1, _FAR, **_SLOPING_ON)
+    slope = _mean((wide[..., -1] - wide[..., 0]) / (2 * _FAR * CELL), 0, _FAR)
     steep = np.abs(slope)
     slope[(steep < _LEAST_SLOPE) | (uneven > _UNEVEN * steep)] = 0.0
     near = _windows(slope, 0, _AHEAD, mode="edge")
@@ -176,15 +176,11 @@ def lateral_slope(heights: Array, steps: Mask) -> Array:
 
 
 def _windows(grid: NDArray[Any], axis: int, n: int, **beyond: Any) -> NDArray[Any]:
-    """The ``n`` samples to both sides of each sample along an axis, and itself, (..., 2 n + 1)."""
-    return sliding_window_view(_padded(grid, axis, n, **beyond), 2 * n + 1, axis)
-
-
-def _padded(grid: NDArray[Any], axis: int, n: int, **beyond: Any) -> NDArray[Any]:
-    """A grid with ``n`` more samples on both ends of an axis; ``beyond`` says which."""
+    """The ``n`` samples to both sides of each sample along an axis, and itself, (..., 2 n + 1);
+    ``beyond`` says what lies beyond the ends of the grid."""
     sides = [(0, 0), (0, 0)]
     sides[axis] = (n, n)
-    return np.pad(grid, sides, **beyond)
+    return sliding_window_view(np.pad(grid, sides, **beyond), 2 * n + 1, axis)
 
 
 def _mean(grid: Array, axis: int, n: int) -> Array:

@@ -4,7 +4,7 @@ The seed and a tile's number determine the tile, so a checkpoint stores numbers 
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,13 @@ FLAT = "flat"
 _EPISODES = 5
 
 
-def check_families(families: Sequence[str]) -> None:
-    """Check that tiles of the families can be made.
+def check_tiles(families: Sequence[str], levels: int) -> None:
+    """Check that tiles of the families can be made, and that none is kept for evaluation: the
+    benchmark reserves ``mixed`` and the highest levels as terrain that no policy has met.
 
     Raises:
-        ValueError: no family, an unknown name, a height map that cannot be used, or ``mixed``.
+        ValueError: no family, an unknown name, a height map that cannot be used, ``mixed``, or a
+            number of levels that is not allowed.
     """
     if not families:
         raise ValueError("'env.families' must name at least one terrain family")
@@ -36,16 +38,7 @@ def check_families(families: Sequence[str]) -> None:
         raise ValueError("'env.families' must not name 'mixed', which is kept for evaluation")
     for family in families:
         check_family(family, (FLAT,))
-
-
-def check_levels(levels: int) -> None:
-    """Check that training uses no level that is kept for evaluation.
-
-    Raises:
-        ValueError: too many levels; the benchmark reserves those above as terrain that no policy
-            has met.
-    """
-    if levels > MAX_LEVEL + 1:
+    if not 1 <= levels <= MAX_LEVEL + 1:
         raise ValueError(f"'env.levels' must be from 1 to {MAX_LEVEL + 1}, not {levels}")
 
 
@@ -74,7 +67,7 @@ class TrainingTiles:
     Args:
         families: (M,) terrain family of each robot.
         seed: seed of the tiles.
-        alter: (tile, level) -> the tile to use instead.
+        shallowest: m, depth of trenches on level 0, see ``shallow``; None: as in the benchmark.
 
     Attributes:
         field: M tiles.
@@ -83,11 +76,9 @@ class TrainingTiles:
         drawn: number of tiles drawn so far.
     """
 
-    def __init__(
-        self, families: Sequence[str], seed: int, alter: Callable[[Tile, int], Tile] | None = None
-    ) -> None:
+    def __init__(self, families: Sequence[str], seed: int, shallowest: float | None = None) -> None:
         m = len(families)
-        self.families, self._seed, self._alter = tuple(families), seed, alter
+        self.families, self._seed, self._shallowest = tuple(families), seed, shallowest
         self.field = TileField(m, crop=TILE_CROP)
         self._relief = np.array([family != FLAT for family in families])
         self.level = np.full(m, -1)  # none yet
@@ -119,7 +110,9 @@ class TrainingTiles:
             family, level = self.families[i], int(self.level[i])
             rng = tile_rng(self._seed, family, level, int(self.number[i]), TRAIN_STREAM)
             tile = make_tile(family, level / MAX_LEVEL, rng)
-            self.field.place(int(i), self._alter(tile, level) if self._alter else tile)
+            if self._shallowest is not None:
+                tile = shallow(tile, level, self._shallowest)
+            self.field.place(int(i), tile)
         return index[(self._heights()[index] != before).any(axis=(1, 2))]
 
     def _heights(self) -> NDArray[np.float32]:
