@@ -42,7 +42,7 @@ from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
 from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
 from tdgc.errors import require, script
-from tdgc.files import make_folder, write_json
+from tdgc.files import make_folder, write_csv, write_json
 from tdgc.parallel import cluster
 from tdgc.parallel.cluster import CLUSTER_HELP
 from tdgc.parallel.cores import usable_cores
@@ -377,7 +377,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     if e.traced is not None:
         diagnosis.write(diagnoses, out / "diagnosis.csv")
         print(f"\n{diagnosis.describe(diagnoses, episodes)}")
-        behaviour.write(behaviours, out / "behaviour.csv")
+        write_csv(out / "behaviour.csv", behaviours[0].row(), (b.row() for b in behaviours))
         print(f"\n{behaviour.describe(behaviours)}")
     if e.tuning is not None:
         effect = tuning.effect(episodes, "tdgc", TUNED)

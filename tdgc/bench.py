@@ -23,7 +23,6 @@ import time
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
@@ -157,17 +156,16 @@ def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
     return updates * ppo.batch_size / (elapsed * ppo.n_epochs)
 
 
-def update_seconds(
-    config: HighTrainConfig, spaces: tuple[gym.spaces.Box, gym.spaces.Box], updates: int
-) -> dict[str, float]:
-    """Median time in s of the high policy's update after one rollout, and the median ``ratio``.
+def compare_updates() -> dict[str, float]:
+    """Content of update.json: median times in s of the high policy's update after one rollout.
 
-    ``stock`` is the update of sb3-contrib and ``fast`` that of ``FastRecurrentPPO``. They take
-    turns, ``updates`` each. ``ratio`` is the median of the ratios stock / fast of the turns,
-    because other work on the machine affects both.
+    ``stock`` is the update of sb3-contrib and ``fast`` that of ``FastRecurrentPPO``, at the default
+    sizes. They take turns, ``UPDATES`` each. ``ratio`` is the median of the ratios stock / fast of
+    the turns, because other work on the machine affects both.
 
     The rollout is noise; an episode starts anywhere, at one in ``_EPISODE`` decisions on average.
     """
+    config = HighTrainConfig()
     ppo, envs = config.ppo, config.n_envs
     learners: dict[str, RecurrentPPO] = {}
     for name, learner, policy in (
@@ -188,21 +186,25 @@ def update_seconds(
             device="cpu",
             _init_setup_model=False,
         )
-        model.observation_space, model.action_space = spaces
+        model.observation_space, model.action_space = high_spaces(config.env)
         model.n_envs = envs
         model._setup_model()
         model.set_logger(Logger(folder=None, output_formats=[]))
         fill(model, np.random.default_rng(0))
         learners[name] = model
     taken: dict[str, list[float]] = {name: [] for name in learners}
-    for _ in range(updates + 1):  # the first one, not counted, creates the optimiser's state
+    for _ in range(UPDATES + 1):  # the first one, not counted, creates the optimiser's state
         for name, model in learners.items():
             started = time.perf_counter()
             model.train()
             taken[name].append(time.perf_counter() - started)
     turns = {name: np.array(seconds[1:]) for name, seconds in taken.items()}
     result = {name: float(np.median(seconds)) for name, seconds in turns.items()}
-    return result | {"ratio": float(np.median(turns["stock"] / turns["fast"]))}
+    result["ratio"] = float(np.median(turns["stock"] / turns["fast"]))
+    head("update", "seconds", "ratio")
+    for name, ratio in (("stock", 1.0), ("fast", result["ratio"])):
+        print(f"{name:<8}{result[name]:>11.3f}{ratio:>11.1f}")
+    return result
 
 
 def fill(model: RecurrentPPO, rng: np.random.Generator) -> None:
@@ -271,16 +273,6 @@ def compare_loads(seconds: float) -> dict[str, Any]:
         learned[str(threads)] = learn(LowTrainConfig(), threads, seconds)
         print(f"{threads:<8}{learned[str(threads)]:>11.0f}", flush=True)
     return {"cores": usable_cores(), "collect": collect, "learn": learned}
-
-
-def compare_updates(updates: int) -> dict[str, float]:
-    """Content of update.json: ``update_seconds`` at the default sizes."""
-    config = HighTrainConfig()
-    result = update_seconds(config, high_spaces(config.env), updates)
-    head("update", "seconds", "ratio")
-    for name, ratio in (("stock", 1.0), ("fast", result["ratio"])):
-        print(f"{name:<8}{result[name]:>11.3f}{ratio:>11.1f}")
-    return result
 
 
 def compare_places(robots: int, workers: int, seconds: float) -> dict[str, Any]:
@@ -386,7 +378,7 @@ def main(arguments: list[str] | None = None) -> int:
     if args.load:
         name, result = "load.json", compare_loads(args.seconds)
     elif args.update:
-        name, result = "update.json", compare_updates(UPDATES)
+        name, result = "update.json", compare_updates()
     elif args.cluster is not None:
         name, result = "cluster.json", compare_places(args.robots, args.workers, args.seconds)
     else:

@@ -43,13 +43,11 @@ from tdgc.files import checksum, make_folder, write_text
 from tdgc.policies import Policy
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import (
+    COMMANDS,
     CONTINUOUS,
-    INDEX,
     NAMES,
-    UNITS,
     VELOCITIES,
     CommandDecoder,
-    command_bounds,
     default_command,
 )
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
@@ -74,27 +72,6 @@ TOLERANCE = 1e-5
 _PACKAGES = ("jsonschema", "onnx", "onnxruntime", "onnxscript")
 _CHECKED_ON = "rough"  # a family on which every step differs from the previous one
 
-
-#: What each command asks for and which direction is positive, in the order of ``NAMES``.
-_MEANINGS = (
-    "velocity ahead, in the frame that turns by yaw alone",
-    "velocity to the left, in the same frame",
-    "positive turns left",
-    "added to the standing height",
-    "gait cycles per second",
-    "duty factor: share of the cycle that a foot spends in stance",
-    "apex of a swing foot above the ground",
-    "positive is nose down",
-    "positive is left side up",
-    *(
-        f"between {feet} footholds; {default_command()[INDEX[name]]:g} is the robot's own stance"
-        for name, feet in (("stance_width", "left and right"), ("stance_length", "front and rear"))
-    ),
-    "price of mechanical power in training",
-    "share of a cycle between diagonal pairs of feet: 0.5 in trot",
-    "share of a cycle between front and rear pair: 0.5 in the gait bound",
-    "share of a cycle between left and right pair: 0.5 in pace",
-)
 #: Unit and meaning of what ``RandomisationConfig`` draws, by its names.
 _DRAWN = {
     "friction": ("1", "coefficient of friction, feet on ground"),
@@ -202,6 +179,8 @@ def _high_table(pair: Pair, graph: HighGraph) -> Table:
     config, physics, robot = pair.high_config, pair.low_config.physics, pair.low_config.robot
     step = config.decimation * physics.control_dt
     ranges = config.commands or pair.low_config.commands
+    stand = CommandDecoder(ranges).nearest(default_command())
+    stand[: len(VELOCITIES)] = 0.0  # stays where it is, even if ``ranges`` has no speed 0
     probes = any(signal.name == "probes" for signal in graph.inputs)
     trained_for = _trained_for(config, physics, {"noise_probes"} if probes else ())
     if probes:
@@ -228,7 +207,7 @@ def _high_table(pair: Pair, graph: HighGraph) -> Table:
                 "then": "stand",
             },
             "after_horizon": "stand",
-            "stand": {"order": "commands", "value": _stand(ranges).tolist()},
+            "stand": {"order": "commands", "value": stand.tolist()},
         },
     }
 
@@ -269,12 +248,12 @@ def _head(name: str, policy: Policy, graph: LowGraph | HighGraph, rate: float) -
 def _commands(ranges: CommandRanges) -> list[Table]:
     """Each command, in order, with its bounds or, if of the embedding, its two values."""
     bounds = CommandDecoder(ranges)
-    rows = zip(NAMES, UNITS, _MEANINGS, bounds.low.tolist(), bounds.high.tolist(), strict=True)
+    rows = zip(COMMANDS.items(), bounds.low.tolist(), bounds.high.tolist(), strict=True)
     return [
         _range(name, unit, meaning, low, high)
         if name in CONTINUOUS
         else {"name": name, "unit": unit, "meaning": meaning, "values": [low, high]}
-        for name, unit, meaning, low, high in rows
+        for (name, (unit, meaning)), low, high in rows
     ]
 
 
@@ -291,14 +270,6 @@ def _trained_for(
             low, high = (middle + drawn.scale * (end - middle) for end in ends)
             table.append(_range(name, unit, meaning, low, high))
     return table
-
-
-def _stand(ranges: CommandRanges) -> Array:
-    """Commands to stay where one is: the default ones, with a posture within ``ranges``."""
-    command, (low, high) = default_command(), command_bounds(ranges).T
-    posture = slice(len(VELOCITIES), len(CONTINUOUS))
-    command[posture] = np.clip(command[posture], low[posture], high[posture])
-    return command
 
 
 def write(pair: Pair, folder: Path, formats: Sequence[str]) -> None:
@@ -424,8 +395,12 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     """
     pair, controller = load_pair(low, high), Controller(folder, form)
     driver = HierarchyDriver(pair.high, pair.high_config)
-    loco, start, goal = _stage(pair, controller)
-    world, executor = loco.world, Executor(loco, pair.low)
+    field = TileField.of(make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
+    physics = dataclasses.replace(pair.low_config.physics, control_dt=controller.dt)
+    world = BulletWorld(1, controller.robot(), physics, field)
+    # The robot is the folder's, what is observed of it are the policies' own configurations.
+    loco = Locomotion(world, pair.low_config)
+    start, goal, executor = field.starts, field.goals, Executor(loco, pair.low)
     differences: list[Array] = []
     seconds: list[float] = []
     log: list[tuple[bool, dict[str, Array]]] = []
@@ -455,18 +430,6 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
         repeated.append(controller.seconds)
     largest = np.abs(np.concatenate(differences)).max()
     return Check(float(largest), np.array(seconds), np.array(repeated))
-
-
-def _stage(pair: Pair, controller: Controller) -> tuple[Locomotion, Array, Array]:
-    """A robot as the controller's folder describes it, on a tile; its start (1, 3) and goal (1, 2).
-
-    What the simulator observes of it are the policies' own configurations.
-    """
-    tile = make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0))
-    config, field = pair.low_config, TileField.of(tile)
-    physics = dataclasses.replace(config.physics, control_dt=controller.dt)
-    loco = Locomotion(BulletWorld(1, controller.robot(), physics, field), config)
-    return loco, field.starts, field.goals
 
 
 def _act(

@@ -1,11 +1,12 @@
 """Atomic file writes, checksums, and writable folders."""
 
 import contextlib
+import csv
 import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,29 @@ def write_json(path: Path, value: Any) -> None:
         OSError: the file cannot be written.
     """
     write_text(path, json.dumps(value, indent=2))
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Read the rows of a CSV file, by column.
+
+    Raises:
+        OSError: the file cannot be read.
+        csv.Error, UnicodeDecodeError: it is not a CSV file.
+    """
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write a CSV file atomically, with one row per mapping from columns to values.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with atomic(path) as partial, open(partial, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(columns))
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def make_folder(folder: Path) -> None:

@@ -1,14 +1,14 @@
 """How robots walk, from traces: shares, headings and means with known answers."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_diagnosis import walk
 
-from tdgc.benchmark.behaviour import MEANS, behaviour, describe, write
+from tdgc.benchmark.behaviour import MEANS, behaviour, describe
 from tdgc.benchmark.trace import Trace
+from tdgc.files import read_csv, write_csv
 
 
 def turned(yaw: float, gaits: tuple[str, str] = ("trot", "trot")) -> Trace:
@@ -53,9 +53,8 @@ def test_a_robot_that_stands_has_no_heading() -> None:
 
 def test_the_file_and_the_table(tmp_path: Path) -> None:
     rows = [behaviour(turned(0.0, ("trot", "pace"))), behaviour(turned(1.5, ("bound", "bound")))]
-    write(rows, tmp_path / "behaviour.csv")
-    with open(tmp_path / "behaviour.csv", newline="", encoding="utf-8") as file:
-        read = list(csv.DictReader(file))
+    write_csv(tmp_path / "behaviour.csv", rows[0].row(), (row.row() for row in rows))
+    read = read_csv(tmp_path / "behaviour.csv")
     assert [float(row["sideways"]) for row in read] == [0.0, 1.0]
     assert list(read[0])[-len(MEANS) :] == list(MEANS) and read[0]["family"] == "rough"
     head, columns, line = describe(rows).splitlines()

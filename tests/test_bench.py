@@ -6,7 +6,6 @@ import json
 import time
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -100,10 +99,13 @@ def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
     for learner in taken:
         monkeypatch.setattr(learner, "train", train)
     monkeypatch.setattr(time, "perf_counter", lambda: now)
-    config = HighTrainConfig(n_envs=4)
-    spaces = tuple(gym.spaces.Box(-1.0, 1.0, (size,), np.float32) for size in (5, 13))
-    result = bench.update_seconds(config, spaces, updates=3)
-    assert result == {"stock": 6.0, "fast": 2.0, "ratio": 3.0}  # ratios of 2, 3 and 6
+    monkeypatch.setattr(bench, "HighTrainConfig", lambda: HighTrainConfig(n_envs=4))
+    monkeypatch.setattr(bench, "UPDATES", 3)
+    assert bench.compare_updates() == {
+        "stock": 6.0,
+        "fast": 2.0,
+        "ratio": 3.0,
+    }  # ratios of 2, 3 and 6
 
 
 @pytest.mark.parametrize(

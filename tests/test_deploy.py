@@ -4,6 +4,7 @@ import copy
 import csv
 import functools
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -182,13 +183,14 @@ def test_fields_that_do_not_fit_are_refused_in_one_line(
     ],
 )
 def test_another_robot_is_refused(
-    folder: Path, tmp_path: Path, controller: Controller, old: str, new: str, message: str
+    folder: Path, tmp_path: Path, old: str, new: str, message: str
 ) -> None:
-    urdf = tmp_path / "other.urdf"
-    urdf.write_text((folder / "quadruped.urdf").read_text().replace(old, new))
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    urdf = tmp_path / "quadruped.urdf"
+    urdf.write_text(urdf.read_text().replace(old, new))
     said = f"not the exported robot's URDF.*{message}.*; use that one, or"
     with pytest.raises(ExportError, match=said):
-        controller.robot(urdf)
+        Controller(tmp_path, FORM).robot()
 
 
 def test_the_folder_brings_its_robot(

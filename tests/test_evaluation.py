@@ -758,7 +758,7 @@ def test_the_path_is_what_was_walked():
     command[:, 0] = 0.5
     places = [batch.loco.world.state.position[:, :2].copy()]
     for step in range(100):
-        executor.step(command, log.live)
+        executor.step(command, batch.live)
         log.add(step)
         places.append(batch.loco.world.state.position[:, :2].copy())
     batch.loco.world.close()

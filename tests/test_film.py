@@ -71,7 +71,7 @@ class Notes:
     def begin(self, batch: Batch) -> None:
         self._loco, self._origin = batch.loco, batch.field.origin(1)
 
-    def step(self, step: int, live: Array, outcome: Array) -> None:
+    def step(self, step: int, live: Array) -> None:
         state = self._loco.world.state
         if 1 in live:
             self.rows.append(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import dataclasses
 import json
 import re
 import shutil
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tdgc.benchmark import diagnosis
 from tdgc.benchmark.diagnosis import Diagnosis
 from tdgc.benchmark.evaluation import CONDITIONS, Episode
 from tdgc.benchmark.results import Training, write_results
@@ -71,10 +70,7 @@ def write_extras(folder: Path) -> None:
         )
         for k, layer in enumerate(["execution"] * 6 + ["decisions"] * 4)
     ]  # fmt: skip
-    with open(folder / "diagnosis.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(Diagnosis)])
-        writer.writeheader()
-        writer.writerows(dataclasses.asdict(d) for d in failed)
+    diagnosis.write(failed, folder / "diagnosis.csv")
     rates = {"n": 10, "reached": 4, "rate": 0.4, "ci_low": 0.168, "ci_high": 0.687}
     before = rates | {"mean_speed": 0.523, "energy_per_metre": 98.7}
     after = rates | {"mean_speed": 0.417, "energy_per_metre": None}

@@ -40,8 +40,8 @@ class Notes(Tracer):
         self.goal, self.seen = batch.goal, [self._note(batch.loco)]
         self.probes = height_probes(batch.loco, PROBES[HighLevelConfig().probes])
 
-    def step(self, step: int, live: Any, outcome: Any) -> None:
-        super().step(step, live, outcome)
+    def step(self, step: int, live: Any) -> None:
+        super().step(step, live)
         self.seen.append(self._note(self._loco))
 
     @staticmethod

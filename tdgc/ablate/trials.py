@@ -23,7 +23,7 @@ from tdgc import policies
 from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import FAILURES, InputError, StoppedError, what_stopped
-from tdgc.files import write_json
+from tdgc.files import read_csv, write_json
 from tdgc.learn.run import signals_restored
 from tdgc.parallel.cores import Workers
 from tdgc.policies.acting import without_correction
@@ -300,11 +300,10 @@ def _reached(path: Path, tiles: Sequence[Tile]) -> NDArray[np.bool_]:
         OSError: the file is missing.
     """
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            outcomes = {
-                (row["family"], int(row["level"]), int(row["episode"])): row["outcome"]
-                for row in csv.DictReader(file)
-            }
+        outcomes = {
+            (row["family"], int(row["level"]), int(row["episode"])): row["outcome"]
+            for row in read_csv(path)
+        }
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise TrialError(f"{path}: damaged, or not of an evaluation") from error
     for tile in tiles:

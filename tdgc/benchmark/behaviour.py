@@ -1,17 +1,14 @@
 """How robots walk: gaits, heading, speed, feet and posture in an episode, from its trace."""
 
-import csv
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.evaluation import EpisodeRecord
 from tdgc.benchmark.trace import Trace
-from tdgc.files import atomic
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.robot import Array, wrap_angle
 
@@ -22,7 +19,6 @@ _COMMANDED = ("frequency", "swing_height", "stance_width")
 #: and more than 135; m/s over the ground; commanded, Hz, m, m; height of the trunk above the
 #: support surface, m; pitch, nose down positive, and the magnitude of roll, rad.
 MEANS = (*GAITS, "sideways", "backward", "speed", *_COMMANDED, "height", "pitch", "roll")
-_IDENTITY = tuple(field.name for field in dataclasses.fields(EpisodeRecord))
 
 
 @dataclass(frozen=True)
@@ -34,6 +30,10 @@ class Behaviour(EpisodeRecord):
     """
 
     means: dict[str, float]
+
+    def row(self) -> dict[str, Any]:
+        """The row of behaviour.csv."""
+        return self.identity | {name: f"{self.means[name]:.4f}" for name in MEANS}
 
 
 def heading_to_travel(x: Array, y: Array, yaw: Array, seconds: Array | float) -> Array:
@@ -73,21 +73,7 @@ def behaviour(trace: Trace) -> Behaviour:
     means |= {name: mean(trace[f"command_{name}"][:-1]) for name in _COMMANDED}
     means |= {"height": mean(trace["base_height"][:-1]), "pitch": mean(trace["pitch"][:-1])}
     means |= {"roll": mean(np.abs(trace["roll"][:-1]))}
-    return Behaviour(**{name: getattr(trace, name) for name in _IDENTITY}, means=means)
-
-
-def write(rows: Sequence[Behaviour], path: Path) -> None:
-    """Write behaviour.csv.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    with atomic(path) as partial, open(partial, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*_IDENTITY, *MEANS])
-        for row in rows:
-            means = (f"{row.means[name]:.4f}" for name in MEANS)
-            writer.writerow([*(getattr(row, name) for name in _IDENTITY), *means])
+    return Behaviour(**trace.identity, means=means)
 
 
 def describe(rows: Sequence[Behaviour]) -> str:

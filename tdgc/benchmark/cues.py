@@ -47,17 +47,6 @@ _GROUND = 0.3  # m, a probe further than this from the standing height does not 
 _WIDEST = 0.35  # m, assumed width of a trench whose end is out of sight: lip to lip at level 10
 
 
-def styles(skill: Skill) -> dict[str, Style]:
-    """How to walk on each family with a low policy of this ``skill``."""
-    return {
-        "rough": skill.uneven,
-        "pillar": skill.among_obstacles,
-        "stair": skill.uneven,
-        "gap": dataclasses.replace(LEAPING, speed=skill.manner.leap_speed),
-        "tilt": SLOPING,
-    }
-
-
 class Memory:
     """What the law remembers about M robots.
 
@@ -101,7 +90,14 @@ class CuesLaw:
 
     def __init__(self, low: LowLevelConfig, skill: Skill, config: HighLevelConfig) -> None:
         self._landing, self._ranges = skill.landing, low.commands
-        self._styles, self._leap_speed = styles(skill), skill.manner.leap_speed
+        self._leap_speed = skill.manner.leap_speed
+        self._styles = {  # how to walk on each family with this low policy
+            "rough": skill.uneven,
+            "pillar": skill.among_obstacles,
+            "stair": skill.uneven,
+            "gap": dataclasses.replace(LEAPING, speed=self._leap_speed),
+            "tilt": SLOPING,
+        }
         self._dt = config.decimation * low.physics.control_dt
         self._points = PROBES[config.probes]
         self._ahead = self._points[:, 1] == 0.0

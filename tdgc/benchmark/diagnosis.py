@@ -10,7 +10,6 @@ Tracking counts as lost where its errors exceed ``LIMITS``, that is, where they 
 all but a few stretches of episodes that reached their goals.
 """
 
-import csv
 import dataclasses
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tdgc.benchmark.evaluation import Episode, EpisodeRecord
 from tdgc.benchmark.trace import NO_TILE, TRACKED, Trace
-from tdgc.files import atomic
+from tdgc.files import write_csv
 from tdgc.sim.families import MAX_LEVEL, UNNAMED
 from tdgc.sim.robot import Array
 from tdgc.sim.terrain import is_map
@@ -126,7 +125,7 @@ def diagnose(trace: Trace, hips: float) -> Diagnosis:
         place, feature = place_of(x), f"{found[0][1]:.2f} m from {found[0][0]}" if found else ""
     (layer, cause), evidence = _judge(trace, tile, hips)
     return Diagnosis(
-        **{field.name: getattr(trace, field.name) for field in dataclasses.fields(EpisodeRecord)},
+        **trace.identity,
         time_s=round(float(trace["time"][-1]), 2),
         place=place,
         feature=feature,
@@ -369,12 +368,9 @@ def to_obstacles(tile: Tile, x: Array, y: Array) -> Array:
 # ---------------------------------------------------------------------------- results
 
 
-def write(diagnoses: Sequence[Diagnosis], path: str | Path) -> None:
+def write(diagnoses: Sequence[Diagnosis], path: Path) -> None:
     """Write diagnosis.csv atomically, one row per failed episode."""
-    with atomic(Path(path)) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(Diagnosis)])
-        writer.writeheader()
-        writer.writerows(dataclasses.asdict(d) for d in diagnoses)
+    write_csv(path, [f.name for f in dataclasses.fields(Diagnosis)], map(vars, diagnoses))
 
 
 def count_failures(

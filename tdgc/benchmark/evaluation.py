@@ -5,6 +5,7 @@ policy, condition and tiles. The table therefore does not depend on how many pro
 batches.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import math
@@ -100,12 +101,6 @@ class Cell:
     first: int
     count: int
 
-    def record(self, k: int, seed: int, outcome: int) -> dict[str, Any]:
-        """Return robot k's fields of ``EpisodeRecord``; ``outcome`` indexes ``OUTCOMES``."""
-        names = ("policy", "condition", "family", "level")
-        where = {name: getattr(self, name) for name in names}
-        return where | {"episode": self.first + k, "seed": seed, "outcome": OUTCOMES[outcome]}
-
 
 @dataclass(frozen=True, eq=False)
 class EpisodeRecord:
@@ -119,6 +114,11 @@ class EpisodeRecord:
     episode: int
     seed: int
     outcome: str
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """These fields, by name."""
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(EpisodeRecord)}
 
     @property
     def where(self) -> str:
@@ -166,7 +166,7 @@ class Episode(EpisodeRecord):
 
     def row(self) -> dict[str, Any]:
         """Return the row of episodes.csv, with one column per gait share."""
-        row = {f.name: getattr(self, f.name) for f in dataclasses.fields(EpisodeRecord)}
+        row = self.identity
         row["time_s"], row["path_m"] = round(self.time_s, 2), round(self.path_m, 3)
         row["energy_j"] = round(self.energy_j, 1)
         return row | {f"share_{g}": round(x, 4) for g, x in zip(GAITS, self.shares, strict=True)}
@@ -219,12 +219,9 @@ class Watcher(Protocol):
     def begin(self, batch: "Batch") -> None:
         """Handle the beginning, with the robots of ``batch`` at their starts."""
 
-    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
-        """Handle the end of control step number ``step``.
-
-        ``live`` (n,) are the robots that took part in it; ``outcome`` (M,) indexes ``OUTCOMES`` and
-        is -1 for robots whose episodes continue.
-        """
+    def step(self, step: int, live: NDArray[np.intp]) -> None:
+        """Handle the end of control step number ``step``, in which the robots ``live`` (n,) took
+        part."""
 
 
 class Batch:
@@ -245,6 +242,8 @@ class Batch:
         told: family that the semantic cue reports.
         sensors, probes: noise of the low policy's observations and of the height probes; None
             without noise.
+        steps: (M,) control steps that each robot has taken.
+        outcome: (M,) index into ``OUTCOMES``, -1 for robots whose episodes continue.
     """
 
     def __init__(
@@ -255,6 +254,7 @@ class Batch:
         make_world: Callable[[TileField], World] | None = None,
     ) -> None:
         self.cell, self.seed = cell, seed
+        self.steps, self.outcome = np.zeros(cell.count, dtype=int), np.full(cell.count, GOING)
         condition, rows = CONDITIONS[cell.condition], np.arange(cell.count)
         self.field = TileField.of(
             *(
@@ -287,6 +287,18 @@ class Batch:
         number = round(HORIZON / physics.control_dt) // self._push_every + 1
         self._pushes = push_velocities(cell, seed, condition.push_speed, number)
 
+    @property
+    def live(self) -> NDArray[np.intp]:
+        """Indices of the robots whose episodes continue, (n,)."""
+        return np.flatnonzero(self.outcome == GOING)
+
+    def record(self, k: int) -> dict[str, Any]:
+        """Robot k's fields of ``EpisodeRecord``, once its episode has ended."""
+        names = ("policy", "condition", "family", "level")
+        where = {name: getattr(self.cell, name) for name in names}
+        ended = {"seed": self.seed, "outcome": OUTCOMES[self.outcome[k]]}
+        return where | {"episode": self.cell.first + k} | ended
+
     def push(self, step: int, live: NDArray[np.intp]) -> None:
         """Push the robots ``live`` (n,) if a push is due before control step number ``step``."""
         number, since = divmod(step, self._push_every)
@@ -295,28 +307,18 @@ class Batch:
 
 
 class EpisodeLog:
-    """Logs a batch at every control step and makes an ``Episode`` for each robot.
-
-    Attributes:
-        outcome: (M,) index into ``OUTCOMES``, -1 for robots whose episodes continue.
-    """
+    """Logs a batch at every control step, decides which episodes end, and makes an ``Episode`` for
+    each robot."""
 
     def __init__(self, batch: Batch) -> None:
         m, self._batch = batch.cell.count, batch
         self._dt = batch.loco.physics.control_dt
         self._horizon = round(HORIZON / self._dt)
         self._pose_every = round(POSE_SECONDS / self._dt)
-        self.outcome = np.full(m, GOING)
-        self._steps = np.zeros(m, dtype=int)
         self._path, self._energy = np.zeros(m), np.zeros(m)
         self._shares = np.zeros((m, len(GAITS)))
         self._poses = [self._pose()]
         self._position = batch.loco.world.state.position[:, :2].copy()
-
-    @property
-    def live(self) -> NDArray[np.intp]:
-        """Indices of the robots whose episodes continue, (n,)."""
-        return np.flatnonzero(self.outcome == GOING)
 
     def add(self, step: int) -> None:
         """Log the state of the robots after control step number ``step``.
@@ -325,7 +327,7 @@ class EpisodeLog:
             FloatingPointError: a robot's position is not finite. In Bullet, the other robots would
                 fall through the ground from now on.
         """
-        batch, state, live = self._batch, self._batch.loco.world.state, self.live
+        batch, state, live = self._batch, self._batch.loco.world.state, self._batch.live
         if not np.isfinite(state.position).all():
             raise FloatingPointError(f"{batch.cell}: a robot's position is not finite")
         position = state.position[:, :2].copy()
@@ -333,27 +335,27 @@ class EpisodeLog:
         self._position = position
         self._energy[live] += self._dt * state.power[live]
         self._shares[live, gait_index(batch.loco.command[live])] += 1.0
-        self._steps[live] = step + 1
+        batch.steps[live] = step + 1
         time_is_up = step + 1 == self._horizon
-        self.outcome[live] = outcome(batch.loco.world, batch.goal, time_is_up)[live]
+        batch.outcome[live] = outcome(batch.loco.world, batch.goal, time_is_up)[live]
         if (step + 1) % self._pose_every == 0:
             self._poses.append(self._pose())
 
     def episodes(self) -> list[Episode]:
         """Return one episode per robot, in order, once all have ended."""
-        cell, last = self._batch.cell, self._pose()
-        kept = -(-self._steps // self._pose_every)  # number of poses before the end
+        batch, last = self._batch, self._pose()
+        kept = -(-batch.steps // self._pose_every)  # number of poses before the end
         return [
             Episode(
-                **cell.record(k, self._batch.seed, self.outcome[k]),
-                time_s=self._steps[k] * self._dt,
+                **batch.record(k),
+                time_s=batch.steps[k] * self._dt,
                 path_m=self._path[k],
                 energy_j=self._energy[k],
-                shares=tuple(self._shares[k] / self._steps[k]),
-                goal=self._batch.field.goals[k],
+                shares=tuple(self._shares[k] / batch.steps[k]),
+                goal=batch.field.goals[k],
                 track=np.array([*(pose[k] for pose in self._poses[: kept[k]]), last[k]]),
             )
-            for k in range(cell.count)
+            for k in range(batch.cell.count)
         ]
 
     def _pose(self) -> Array:
@@ -378,10 +380,8 @@ def run_cell(
         One episode per robot, in order.
     """
     batch = Batch(cell, mdp_of(low), seed)
-    try:
+    with contextlib.closing(batch.loco.world):
         return closed_loop(driver, Executor(batch.loco, low, batch.sensors), batch, watchers)
-    finally:
-        batch.loco.world.close()
 
 
 def closed_loop(
@@ -396,7 +396,7 @@ def closed_loop(
         watcher.begin(batch)
     log = EpisodeLog(batch)
     for step in itertools.count():
-        live = log.live
+        live = batch.live
         if not live.size:
             break
         batch.push(step, live)
@@ -406,8 +406,8 @@ def closed_loop(
         executor.step(commands, live)
         log.add(step)
         for watcher in watchers:
-            watcher.step(step, live, log.outcome)
-        batch.loco.world.retire(np.setdiff1d(live, log.live))
+            watcher.step(step, live)
+        batch.loco.world.retire(np.setdiff1d(live, batch.live))
     return log.episodes()
 
 

@@ -33,7 +33,7 @@ from tdgc.benchmark.diagnosis import (
 from tdgc.benchmark.drivers import BaselineDriver, Decides, Driver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Cell, run_cell
 from tdgc.benchmark.trace import Trace, Tracer
-from tdgc.config import HighLevelConfig, LowLevelConfig
+from tdgc.config import HighLevelConfig
 from tdgc.errors import script
 from tdgc.policies import Policy
 from tdgc.sim.commands import INDEX, VELOCITIES
@@ -195,20 +195,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     low, low_config = load_low(args.low)
     pair = load_high(args.high, low, low_config)
-    count_blames(low, low_config, pair, float(read_geometry(low_config.robot).hips[0, 0]))
-    return 0
-
-
-def count_blames(
-    low: Policy, low_config: LowLevelConfig, pair: tuple[Policy, HighLevelConfig], hips: float
-) -> None:
-    """Print how often the right layer is blamed, and the pair's tracking errors without a fault.
-
-    Args:
-        low, low_config: the low policy and its MDP.
-        pair: the high policy and its MDP.
-        hips: m, distance of the hips ahead of the trunk's centre.
-    """
+    hips = float(read_geometry(low_config.robot).hips[0, 0])
     print("fault".ljust(38) + "layer".ljust(11) + "".join(f"{name:>9}" for name in FAMILIES))
     right = total = 0
     for fault in FAULTS:
@@ -236,6 +223,7 @@ def count_blames(
             f"{name.ljust(11)}{stretch:>6.2f} {limit.unit:<5}{limit.stretch:>8.2f}"
             f"{episode:>6.2f} {limit.unit:<5}{limit.episode:>8.2f}"
         )
+    return 0
 
 
 if __name__ == "__main__":

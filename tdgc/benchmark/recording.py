@@ -63,13 +63,9 @@ class Recorder:
         self._batch, cell = batch, batch.cell
         self._rows = np.arange(max(0, min(cell.count, self._count - cell.first)))
         self._origin = np.pad(batch.origin[self._rows], ((0, 0), (0, 1)))
-        self._steps = np.zeros(cell.count, dtype=int)
-        self._outcome = np.full(cell.count, -1)
         self._kept: list[dict[str, NDArray[Any]]] = []
 
-    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
-        self._outcome = outcome.copy()
-        self._steps[live] = step + 1
+    def step(self, step: int, live: NDArray[np.intp]) -> None:
         rows, loco = self._rows, self._batch.loco
         if not np.isin(rows, live).any():
             return
@@ -92,8 +88,7 @@ class Recorder:
         batch, loco = self._batch, self._batch.loco
         result = []
         for k in self._rows.tolist():
-            steps = self._kept[: self._steps[k]]
-            fields = batch.cell.record(k, batch.seed, self._outcome[k])
+            steps, fields = self._kept[: batch.steps[k]], batch.record(k)
             fields |= {key: np.array([step[key][k] for step in steps]) for key in steps[0]}
             fields |= {"robot": loco.robot, "dt": loco.physics.control_dt}
             result.append(Recording(**fields, bounds=command_bounds(self._driver.bounds)))

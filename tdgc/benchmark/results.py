@@ -1,7 +1,6 @@
 """Results of an evaluation: tables of rates, and the files of a results folder."""
 
 import contextlib
-import csv
 import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from tdgc.benchmark.evaluation import Cell, Episode, complete
 from tdgc.benchmark.intervals import difference, rates
 from tdgc.config import LowLevelConfig, differences, to_dict
 from tdgc.errors import InputError
-from tdgc.files import atomic, make_folder, write_json
+from tdgc.files import atomic, make_folder, write_csv, write_json
 from tdgc.sim.terrain import EDITION
 
 #: Files written by ``write_results``.
@@ -186,16 +185,12 @@ def editions_of(metas: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
 def robot_changes(mdp: LowLevelConfig) -> list[str]:
     """List what a low policy's ``mdp`` has in place of the benchmark's robot, motors and physics,
     such as ``robot.kp=18.6, not 20.0``."""
-
-    def prescribed(config: LowLevelConfig) -> dict[str, Any]:
-        tables = to_dict(config)
-        return {
-            "robot": {name: tables["robot"][name] for name in _PRESCRIBED},
-            "physics": tables["physics"],
-        }
-
-    found, usual = prescribed(mdp), prescribed(LowLevelConfig())
-    return [text for name in found for text in differences(found[name], usual[name], name)]
+    mine, usual = to_dict(mdp), to_dict(LowLevelConfig())
+    robot = {name: mine["robot"][name] for name in _PRESCRIBED}
+    return [
+        *differences(robot, usual["robot"], "robot"),
+        *differences(mine["physics"], usual["physics"], "physics"),
+    ]
 
 
 def policies_of(summary: dict[str, Any]) -> dict[str, Any]:
@@ -244,13 +239,7 @@ def write_results(
     trajectories.npz holds the tracks in the order of episodes.csv: ``poses`` (N, 3) of all episodes
     one after another, ``counts`` (E,), the number of poses of each episode, and ``goals`` (E, 2).
     """
-    with (
-        atomic(folder / "episodes.csv") as partial,
-        open(partial, "w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.DictWriter(file, list(episodes[0].row()))
-        writer.writeheader()
-        writer.writerows(e.row() for e in episodes)
+    write_csv(folder / "episodes.csv", episodes[0].row(), (e.row() for e in episodes))
     # Pass an open file, because NumPy would append its suffix to a name.
     with atomic(folder / "trajectories.npz") as partial, open(partial, "wb") as tracks:
         np.savez_compressed(

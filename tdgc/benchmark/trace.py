@@ -199,17 +199,14 @@ class Tracer:
         self._horizon = episode_steps(config.episode_seconds, seconds)
         decoder = CommandDecoder(config.commands, config.action_limit, config.gaits)
         self._rewards = HighReward(config, decoder, m, seconds)
-        self._steps = np.zeros(m, dtype=int)
-        self._outcome = np.full(m, -1)
         self._rows: list[dict[str, NDArray[Any]]] = []
         self._clear()
         self._look()
 
-    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+    def step(self, step: int, live: NDArray[np.intp]) -> None:
         if step % self._decimation == 0:
             self._decide()
         self._measure(live)
-        self._outcome = outcome.copy()
         if (step + 1) % self._decimation == 0:
             self._look()
 
@@ -217,10 +214,10 @@ class Tracer:
         """The traces of the most recently watched batch, in order."""
         if self._count.any():  # the last episodes ended between two decisions
             self._look()
-        cell, result, driver = self._batch.cell, [], self._driver
+        batch, result, driver = self._batch, [], self._driver
         places = "" if driver.probes is None else probe_places(PROBES[driver.config.probes])
-        decisions = -(-self._steps // self._decimation)  # the last one may have been cut short
-        for k in range(cell.count):
+        decisions = -(-batch.steps // self._decimation)  # the last one may have been cut short
+        for k in range(batch.cell.count):
             rows = self._rows[: decisions[k] + 1]
             columns: dict[str, NDArray[Any]] = {}
             for c in COLUMNS:
@@ -228,8 +225,7 @@ class Tracer:
                 columns[c.name] = np.array([row[c.name][k] for row in rows], dtype=kind)
                 if c.name in _DECIDED:  # other robots may have decided after this one ended
                     columns[c.name][-1] = None if kind is object else np.nan
-            record = cell.record(k, self._batch.seed, self._outcome[k])
-            result.append(Trace(**record, columns=columns, probes=places))
+            result.append(Trace(**batch.record(k), columns=columns, probes=places))
         return result
 
     # ------------------------------------------------------------------ a row
@@ -260,7 +256,6 @@ class Tracer:
         wanted = loco.command[:, [INDEX[name] for name in TRACKED]]
         match = state.touching == (loco.clock.contact > 0.5)
         values = np.column_stack([measured - wanted, state.touching, match, state.power])
-        self._steps[live] += 1
         self._count[live] += 1.0
         self._sums[live] += values[live]
         self._rewards.measure(state, live)
@@ -273,7 +268,7 @@ class Tracer:
         row: dict[str, NDArray[Any]] = {
             c.name: nothing if c.unit else np.full(len(nothing), None, object) for c in COLUMNS
         }
-        row["time"] = self._dt * self._steps
+        row["time"] = self._dt * self._batch.steps
         row["base_x"], row["base_y"] = (state.position[:, :2] - self._batch.origin).T
         row["base_z"] = state.position[:, 2].copy()
         row["base_height"] = self._loco.world.trunk_height()

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import HierarchyDriver
 from tdgc.benchmark.evaluation import Episode
-from tdgc.benchmark.results import success
+from tdgc.benchmark.results import compare, success
 from tdgc.config import (
     CommandRanges,
     ConfigError,
@@ -257,9 +257,8 @@ def effect(episodes: Sequence[Episode], before: str, after: str) -> dict[str, An
     which only ``after`` reached the goal, ``lost`` those on which only ``before`` did.
     """
     result: dict[str, Any] = {}
-    for condition in dict.fromkeys(e.condition for e in episodes):
+    for condition, families in compare(episodes, after, before).items():
         found: dict[str, Any] = {}
-        reached = []
         for policy in (before, after):
             rows = [e for e in episodes if (e.condition, e.policy) == (condition, policy)]
             path = sum(e.path_m for e in rows)
@@ -267,9 +266,7 @@ def effect(episodes: Sequence[Episode], before: str, after: str) -> dict[str, An
                 "mean_speed": path / sum(e.time_s for e in rows),
                 "energy_per_metre": sum(e.energy_j for e in rows) / path if path > 0.0 else None,
             }
-            reached.append({(e.family, e.level, e.episode) for e in rows if e.outcome == "reached"})
-        found["gained"], found["lost"] = len(reached[1] - reached[0]), len(reached[0] - reached[1])
-        result[condition] = found
+        result[condition] = found | {key: families["mean"][key] for key in ("gained", "lost")}
     return result
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from tdgc.config import CommandRanges, RobotConfig
 from tdgc.deploy.interface import ExportError, Table, pair_misfits, read_interface
 from tdgc.files import checksum
-from tdgc.sim.commands import CONTINUOUS
 from tdgc.sim.geometry import read_geometry
 from tdgc.sim.robot import NUM_JOINTS, Array, RobotState, nominal_height, nominal_pose
 from tdgc.sim.urdf import JOINTS
@@ -105,9 +104,7 @@ class Graph:
         self.seconds = time.thread_time() - started
         made = dict(zip(self._outputs, outputs, strict=True))
         self.values = dict(zip(self._inputs, inputs, strict=True)) | made
-        self.memory = self.memory | {
-            name: self.values[source] for name, source in self._kept.items()
-        }
+        self.memory |= {name: self.values[source] for name, source in self._kept.items()}
         return made
 
 
@@ -243,24 +240,15 @@ class Controller:
             raise ExportError(
                 f"low and high in '{folder}' are of two exports: {misfit}; export the pair again"
             )
-        self._order = [(entry["graph"], entry["every"]) for entry in high["order"]]
         self._task, self._probes = high["task"], high["probes"]
         self._stand = np.array(self._task["stand"]["value"])
         self._places = np.array(self._probes["ahead_left"]["value"])
         self._level = np.array(low["frames"]["gravity_when_level"]["value"])
-        self._sources = {
-            name: [
-                (s["name"], *s["source"].split("."))
-                for s in graph.table["inputs"]
-                if s["source"] is not None
-            ]
-            for name, graph in self._graphs.items()
-        }
         self.dt = 1.0 / low["rate"]["value"]
-        self.decimation = next(every for name, every in self._order if name == "high")
+        self.decimation = high["order"][0]["every"]  # its schema has ``high`` first
         self.horizon = round(self._task["horizon"]["value"] / self.dt)
         ranges = {c["name"]: (c["low"], c["high"]) for c in high["commands"] if "low" in c}
-        self.bounds = CommandRanges(**{name: ranges[name] for name in CONTINUOUS})
+        self.bounds = CommandRanges(**ranges)
         self.reset()
 
     def reset(self, clock: float | None = None) -> None:
@@ -271,6 +259,7 @@ class Controller:
                 graph.memory["clock"] = np.array([clock])
         self.count, self.commands, self.decided, self.seconds = 0, self._stand, False, 0.0
         self._reached_at: int | None = None
+        self._latest: dict[str, Array] = {}  # outputs of both graphs, as "graph.name"
 
     def sense(
         self, state: RobotState, goal: Array, family: str, ground: Callable[[Array, Array], Array]
@@ -329,44 +318,37 @@ class Controller:
         if reached_at is None and np.linalg.norm(readings["goal"]) < near:
             reached_at = self.count
         over = self.over(self.count, reached_at)
-        due = [
-            name
-            for name, every in self._order
-            if self.count % every == 0 and not (name == "high" and over)
-        ]
+        decides = self.count % self.decimation == 0 and not over
+        due = GRAPHS[::-1] if decides else ("low",)
         for name in due:
             self._graphs[name].check(readings)
-        self._reached_at = reached_at
-        self.decided, self.seconds = False, 0.0
+        self._reached_at, self.decided, self.seconds = reached_at, decides, 0.0
         for name in due:
             graph = self._graphs[name]
             taken = {
-                mine: self._graphs[other].values[signal]
-                for mine, other, signal in self._sources[name]
-                if self._graphs[other].values  # it has run in this episode
+                signal["name"]: self._latest[signal["source"]]
+                for signal in graph.table["inputs"]
+                if signal["source"] in self._latest
             }
             if name == "low" and over:
                 taken["commands"] = self._stand
-            graph(readings | taken)
+            for signal, value in graph(readings | taken).items():
+                self._latest[f"{name}.{signal}"] = value
             self.seconds += graph.seconds
-            self.decided |= name == "high"
         self.commands = self.low.values["commands"]
         self.count += 1
         return self.low.values["joint_targets"]
 
-    # ------------------------------------------------------------------ the robot
-
-    def robot(self, urdf: Path | None = None) -> RobotConfig:
+    def robot(self) -> RobotConfig:
         """The robot that the interface describes, as a configuration for this package's simulation.
-
-        ``urdf`` defaults to the copy in the folder.
 
         Raises:
             ConfigError: this package cannot read the URDF.
             ExportError: the URDF is of another robot, or joint settings differ from leg to leg.
         """
         table = self.low.table
-        urdf = urdf or self._folder / table["robot"]["urdf"]["file"]
+        file = table["robot"]["urdf"]["file"]
+        urdf = self._folder / file
         control, pose = table["joint_control"], table["start"]["joint_angles"]["value"]
         hip, thigh, calf = pose[:3]
         limits = [tuple(control[k]["value"][:3]) for k in ("torque_limit", "speed_limit")]
@@ -392,37 +374,29 @@ class Controller:
         ):
             if not np.array_equal(told, taken):
                 raise ExportError(f"{what} differs from leg to leg: {told}, not {list(taken)}")
-        self._compare(config, urdf)
-        return config
-
-    def _compare(self, config: RobotConfig, urdf: Path) -> None:
-        """Check that a URDF describes the exported robot.
-
-        Raises:
-            ExportError: joint limits, masses, start height or checksum differ.
-        """
-        geometry, table = read_geometry(config), self.low.table
-        limits = table["joint_control"]["joint_limits"]
-        told = np.column_stack([limits["low"], limits["high"]])
-
-        def refused(difference: str) -> ExportError:
-            file = table["robot"]["urdf"]["file"]
-            return ExportError(
+        for difference in self._differences(config):
+            raise ExportError(
                 f"{urdf}: not the exported robot's URDF, {file}: {difference}; use that one, or "
                 "export the pair again"
             )
+        return config
 
+    def _differences(self, config: RobotConfig) -> Iterator[str]:
+        """Describe how the robot of ``config`` differs from the exported one."""
+        geometry, table = read_geometry(config), self.low.table
+        limits = table["joint_control"]["joint_limits"]
+        told = np.column_stack([limits["low"], limits["high"]])
         for joint, mine, wanted in zip(JOINTS, geometry.joint_limits, told, strict=True):
             if not np.array_equal(mine, wanted):
                 ends = [f"from {low:g} to {high:g} rad" for low, high in (mine, wanted)]
-                raise refused(f"{joint} turns {ends[0]}, that robot's {ends[1]}")
+                yield f"{joint} turns {ends[0]}, that robot's {ends[1]}"
         masses = table["robot"]["link_masses"]["value"]
         for link in (*masses, *geometry.masses):
             mine, wanted = geometry.masses.get(link, 0.0), masses.get(link, 0.0)
             if mine != wanted:
-                raise refused(f"link {link} has {mine:g} kg, that robot's {wanted:g}")
+                yield f"link {link} has {mine:g} kg, that robot's {wanted:g}"
         height, wanted = nominal_height(config, geometry), table["start"]["trunk_height"]["value"]
         if not np.isclose(height, wanted, rtol=0.0, atol=1e-9):
-            raise refused(f"starts {height:g} m high, that robot {wanted:g}")
-        if checksum(urdf) != table["robot"]["urdf"]["sha256"]:
-            raise refused("joint limits and masses agree, its checksum does not")
+            yield f"starts {height:g} m high, that robot {wanted:g}"
+        if checksum(Path(config.urdf)) != table["robot"]["urdf"]["sha256"]:
+            yield "joint limits and masses agree, its checksum does not"

@@ -345,8 +345,8 @@ class LowGraph(nn.Module):
         return (*step, cycles + run) if self.counted else step
 
 
-def _high_inputs(seconds: float) -> list[Signal]:
-    """Inputs that every high policy has, of episodes of ``seconds`` s."""
+def _high_inputs(config: HighLevelConfig, robot: RobotConfig, seconds: float) -> list[Signal]:
+    """Inputs of a high policy in episodes of ``seconds`` s, except its state."""
     goal = (
         "ahead of and to the left of the origin of the URDF's root link, in the frame that turns "
         "by yaw alone"
@@ -354,18 +354,6 @@ def _high_inputs(seconds: float) -> list[Signal]:
     clock = "the low policy's in its coming step"
     last = "those of the last decision"
     start = tuple(default_command().tolist())
-    return [
-        Signal("goal", 2, "m", goal),
-        Signal("time_left", 1, "s", f"left of the episode's {seconds:g} s"),
-        *_BODY,
-        Signal("last_decision", NUM_ACTIONS, "1", "the last one", "decision", "decision", 0.0),
-        Signal("last_commands", NUM_COMMANDS, None, last, "commands", "commands", start),
-        Signal("clock", 1, "1", clock, start=0.0, source="low.next_clock"),
-    ]
-
-
-def _cues(config: HighLevelConfig, robot: RobotConfig) -> list[Signal]:
-    """Inputs that a high policy has only if it observes them."""
     family = "1 for the terrain of the whole tile, from start to goal; 0 for the others"
     probes = (
         "ground at points of the frame that turns by yaw alone, above a plane "
@@ -373,13 +361,21 @@ def _cues(config: HighLevelConfig, robot: RobotConfig) -> list[Signal]:
         f"{PROBE_RANGE:g} m"
     )
     before = "the goal at the last decision; 0 at the first"
-    cues = {
+    cues = {  # only if the policy observes them
         "family": Signal("family", len(SEMANTIC), "1", family, "families"),
         "probes": Signal("probes", NUM_PROBES, "m", probes, "probes"),
         "probe_age": Signal("probe_age", 1, "s", "since the probes were measured"),
         "closing_speed": Signal("last_goal", 2, "m", before, None, "goal", 0.0),
     }
-    return [cues[term.name] for term in high_layout(config) if term.name in cues]
+    return [
+        Signal("goal", 2, "m", goal),
+        Signal("time_left", 1, "s", f"left of the episode's {seconds:g} s"),
+        *_BODY,
+        Signal("last_decision", NUM_ACTIONS, "1", "the last one", "decision", "decision", 0.0),
+        Signal("last_commands", NUM_COMMANDS, None, last, "commands", "commands", start),
+        Signal("clock", 1, "1", clock, start=0.0, source="low.next_clock"),
+        *(cues[term.name] for term in high_layout(config) if term.name in cues),
+    ]
 
 
 class HighGraph(nn.Module):
@@ -408,8 +404,7 @@ class HighGraph(nn.Module):
         actions = "the policy's actions, clipped but not decoded"
         size = policy.state_size
         self.inputs = [
-            *_high_inputs(seconds),
-            *_cues(config, low.robot),
+            *_high_inputs(config, low.robot, seconds),
             *(Signal(k, size, "1", what, None, f"next_{k}", 0.0) for k, what in state.items()),
         ]
         self.outputs = [

@@ -87,11 +87,7 @@ def layout(controller: Controller) -> dict[str, int]:
 
 
 class LogWriter:
-    """Records the inputs and outputs of a controller.
-
-    Args:
-        controller: the controller whose steps are logged.
-    """
+    """Records the inputs and outputs of a controller in each of its steps."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller, self._layout = controller, layout(controller)
@@ -364,15 +360,11 @@ def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
         raise LogError(f"{log.name}: comes no nearer to the goal than {distance.min():.2f} m")
     if controller.over(len(log.time) - 1, None):
         return "timeout"
+    ends = f"{log.name}: ends at {log.time[-1]:.2f} s"
     if told == "timeout":
-        raise LogError(
-            f"{log.name}: ends at {log.time[-1]:.2f} s, before the horizon of "
-            f"{task['horizon']['value']:g} s"
-        )
-    raise LogError(
-        f"{log.name}: ends at {log.time[-1]:.2f} s, {distance[-1]:.2f} m from the goal; say how "
-        f"with --outcome {' or '.join(ENDS[1:3])}"
-    )
+        raise LogError(f"{ends}, before the horizon of {task['horizon']['value']:g} s")
+    how = f"--outcome {' or '.join(ENDS[1:3])}"
+    raise LogError(f"{ends}, {distance[-1]:.2f} m from the goal; say how with {how}")
 
 
 def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:

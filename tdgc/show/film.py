@@ -115,16 +115,13 @@ def set_stage(
     return stage
 
 
-@contextlib.contextmanager
-def staged(recording: Recording, trail: bool = False) -> Iterator[Stage]:
-    """Open the stage of ``recording``; ``trail`` paints the base's path on the ground."""
+def staged(recording: Recording, trail: bool = False) -> contextlib.closing[Stage]:
+    """The stage of ``recording``, to be used in a ``with`` statement, which closes it; ``trail``
+    paints the base's path on the ground."""
     way = recording.position[:, :2] if trail else None
     colour = POLICY_COLOURS[recording.policy]
     stage = set_stage(recording.tile(), recording.robot, way=way, colour=colour)
-    try:
-        yield stage
-    finally:
-        stage.close()
+    return contextlib.closing(stage)
 
 
 def camera_way(recording: Recording) -> Array:

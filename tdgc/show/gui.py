@@ -4,16 +4,17 @@ The window only displays the robot, which is simulated in a separate world. So n
 in the window affects the robot, except the sliders.
 """
 
+import itertools
 import time
+from contextlib import closing, suppress
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdgc.benchmark.drivers import Driver
-from tdgc.benchmark.evaluation import CONDITIONS, Batch, Cell, benchmarked, run_cell, tile_of
+from tdgc.benchmark.evaluation import Batch, Cell, run_cell, tile_of
 from tdgc.policies import Policy
 from tdgc.show.film import set_stage
-from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import (
     CONTINUOUS,
     INDEX,
@@ -25,10 +26,8 @@ from tdgc.sim.commands import (
 )
 from tdgc.sim.display import WindowError
 from tdgc.sim.gaits import GAITS, gait_embedding
-from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.stage import Stage
-from tdgc.sim.tile import TileField
 from tdgc.tasks.executor import Executor
 from tdgc.tasks.pairing import mdp_of
 from tdgc.tasks.rules import GOING, OUTCOMES, outcome
@@ -56,9 +55,9 @@ def describe(command: Array) -> str:
 class _Window:
     """Keeps the stage in step with a world of one robot, in real time."""
 
-    def __init__(self, loco: Locomotion, field: TileField, stage: Stage) -> None:
-        self._loco, self._stage, self._dt = loco, stage, loco.physics.control_dt
-        self._origin = np.append(field.origin(0), 0.0)
+    def __init__(self, batch: Batch, stage: Stage) -> None:
+        self._loco, self._stage, self._dt = batch.loco, stage, batch.loco.physics.control_dt
+        self._origin = np.append(batch.origin[0], 0.0)
         self._every = max(1, round(_TEXT_SECONDS / self._dt))
         self._due = time.perf_counter()
 
@@ -84,45 +83,34 @@ def drive(low: Policy, cell: Cell, seed: int) -> None:
 
     Args:
         low: the low policy.
-        cell: determines the tile; its policy does not matter.
+        cell: one nominal episode, of which the tile matters.
         seed: of the evaluation's tiles.
 
     Raises:
         WindowError: the window cannot be opened.
     """
-    config = benchmarked(mdp_of(low), CONDITIONS["nominal"])
+    config = mdp_of(low)
     tile = tile_of(seed, cell.family, cell.level, cell.first)
-    stage, field = set_stage(tile, config.robot, window=True), TileField.of(tile)
-    loco = Locomotion(BulletWorld(1, config.robot, config.physics, field), config)
+    stage, batch = set_stage(tile, config.robot, window=True), Batch(cell, config, seed)
+    loco = batch.loco
     executor = Executor(loco, low)
-    decoder, start = CommandDecoder(config.commands), default_command()
+    decoder, default = CommandDecoder(config.commands), default_command()
     for j, name in enumerate(CONTINUOUS):
         label = name if UNITS[j] == "1" else f"{name} ({UNITS[j]})"
-        stage.add_slider(label, decoder.low[j], decoder.high[j], start[j])
+        stage.add_slider(label, decoder.low[j], decoder.high[j], default[j])
     stage.add_slider(f"gait ({', '.join(GAITS)})", 0, len(GAITS) - 1, 0)
     stage.add_slider("back to the start", 1, 0, 0)
-    window = _Window(loco, field, stage)
-    row, place = np.zeros(1, dtype=int), field.starts[0]
-
-    def begin() -> None:
-        loco.place(row, place[None, :2] + field.origin(row), place[2:], np.zeros(1))
-
-    begin()
-    step, pressed = 0, 0.0
-    try:
-        while True:
+    window, row, start = _Window(batch, stage), np.zeros(1, dtype=int), batch.field.starts
+    pressed = 0.0
+    # That the window is closed is the normal end.
+    with closing(stage), closing(loco.world), suppress(WindowError):
+        for step in itertools.count():
             values = stage.read_sliders()
             executor.step(slider_command(values[:-1])[None])
             if values[-1] != pressed or outcome(loco.world)[0] != GOING:
                 pressed = float(values[-1])
-                begin()
+                loco.place(row, start[:, :2] + batch.origin, start[:, 2], np.zeros(1))
             window.update(step, describe(loco.command[0]))
-            step += 1
-    except WindowError:
-        pass  # the window was closed: the normal end
-    finally:
-        loco.world.close()
-        stage.close()
 
 
 class Monitor:
@@ -137,13 +125,12 @@ class Monitor:
         self.text = ""
 
     def begin(self, batch: Batch) -> None:
-        self._loco = batch.loco
-        self._window = _Window(batch.loco, batch.field, self._stage)
+        self._batch, self._window = batch, _Window(batch, self._stage)
 
-    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
-        self.text = describe(self._loco.command[0])
-        if outcome[0] >= 0:
-            self.text = OUTCOMES[outcome[0]].replace("_", " ")
+    def step(self, step: int, live: NDArray[np.intp]) -> None:
+        self.text = describe(self._batch.loco.command[0])
+        if self._batch.outcome[0] != GOING:
+            self.text = OUTCOMES[self._batch.outcome[0]].replace("_", " ")
         self._window.update(step, self.text)
 
 
@@ -161,13 +148,9 @@ def watch(low: Policy, driver: Driver, cell: Cell, seed: int) -> None:
     """
     tile = tile_of(seed, cell.family, cell.level, cell.first)
     stage = set_stage(tile, mdp_of(low).robot, window=True)
-    try:
+    with closing(stage), suppress(WindowError):  # as in ``drive``
         monitor = Monitor(stage)
         run_cell(cell, low, driver, seed, [monitor])
         while True:
             stage.follow(monitor.text)
             time.sleep(_TEXT_SECONDS)
-    except WindowError:
-        pass  # the window was closed: the normal end
-    finally:
-        stage.close()

@@ -1,6 +1,5 @@
 """Figures (PNG) from result files, logs and recordings. Nothing here simulates or trains."""
 
-import csv
 import json
 import textwrap
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ from tdgc.benchmark import behaviour
 from tdgc.benchmark.evaluation import POSE_SECONDS, tile_of
 from tdgc.benchmark.recording import Recording, runs_of_equal, spans
 from tdgc.benchmark.results import policies_of
-from tdgc.files import atomic
+from tdgc.files import atomic, read_csv
 from tdgc.sim.commands import CONTINUOUS, INDEX, UNITS, gait_index
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.robot import Array
@@ -71,8 +70,7 @@ class _Run(NamedTuple):
 
 def _read(folder: Path) -> list[_Run]:
     """Read the episodes of the first condition in a results folder."""
-    with open(folder / "episodes.csv", newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(folder / "episodes.csv")
     with np.load(folder / "trajectories.npz") as data:
         tracks = np.split(data["poses"], np.cumsum(data["counts"])[:-1])
         runs = [_Run(*parts) for parts in zip(rows, data["goals"], tracks, strict=True)]

@@ -6,7 +6,6 @@ module; Jinja escapes every value inserted into it.
 """
 
 import base64
-import csv
 import glob
 import json
 from collections import Counter
@@ -20,7 +19,7 @@ import tdgc
 from tdgc.benchmark.diagnosis import LAYERS, count_failures
 from tdgc.benchmark.evaluation import CONDITIONS, EpisodeRecord
 from tdgc.benchmark.results import EDITIONS, PAIRED, ROBOT, SIDES, policies_of, verdict
-from tdgc.files import write_text
+from tdgc.files import read_csv, write_text
 from tdgc.sim.terrain import is_map
 from tdgc.tasks.rules import FALL_HEIGHT, GOAL_RADIUS, HORIZON, OUTCOMES, TRUNK_FORCE
 
@@ -63,11 +62,6 @@ def data_uri(path: Path) -> str:
     """
     kind = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}[path.suffix]
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
-
-
-def _rows(path: Path) -> list[Row]:
-    with open(path, newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def _json(path: Path) -> Any:
@@ -200,9 +194,9 @@ def render(folder: Path) -> str:
         OSError: a file is missing or cannot be read.
         ValueError: a file has content that an evaluation does not write.
     """
-    written, episodes = _json(folder / "summary.json"), _rows(folder / "episodes.csv")
+    written, episodes = _json(folder / "summary.json"), read_csv(folder / "episodes.csv")
     has_diagnoses = (folder / "diagnosis.csv").is_file()
-    diagnoses = _rows(folder / "diagnosis.csv") if has_diagnoses else []
+    diagnoses = read_csv(folder / "diagnosis.csv") if has_diagnoses else []
     films = folder / "films"
     filmed = [r for r in episodes if any(films.glob(f"[!.]*_{glob.escape(record_of(r).name)}.*"))]
     environment = jinja2.Environment(

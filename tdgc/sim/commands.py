@@ -1,23 +1,4 @@
-"""The 15 commands, and the decoder D that maps 13 actions to them (paper Sec. IV-B).
-
-======  =============  =====  ==================================================
-index   name           unit   meaning
-======  =============  =====  ==================================================
-0       vx             m/s    forward velocity in the heading frame
-1       vy             m/s    leftward velocity in the heading frame
-2       yaw_rate       rad/s  turning left is positive
-3       body_height    m      added to the standing height
-4       frequency      Hz     gait cycles per second
-5       duration       1      duty factor: share of a cycle in stance
-6       swing_height   m      apex of a swing foot above the ground
-7       pitch          rad    nose down is positive
-8       roll           rad    left side up is positive
-9       stance_width   m      between left and right footholds
-10      stance_length  m      between front and rear footholds
-11      power_weight   1/W    weight of mechanical power in the reward (auxiliary)
-12-14   phase, offset, bound  gait embedding e(g), see ``tdgc.sim.gaits``
-======  =============  =====  ==================================================
-"""
+"""The 15 commands, and the decoder D that maps 13 actions to them (paper Sec. IV-B)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -28,11 +9,28 @@ from numpy.typing import ArrayLike, NDArray
 from tdgc.config import CommandRanges
 from tdgc.sim.gaits import GAITS, gait_embedding
 
+#: Unit and meaning of each command, in order. ``power_weight`` is the auxiliary, and the last three
+#: are the gait embedding e(g), see ``tdgc.sim.gaits``.
+COMMANDS: dict[str, tuple[str, str]] = {
+    "vx": ("m/s", "velocity ahead, in the frame that turns by yaw alone"),
+    "vy": ("m/s", "velocity to the left, in the same frame"),
+    "yaw_rate": ("rad/s", "positive turns left"),
+    "body_height": ("m", "added to the standing height"),
+    "frequency": ("Hz", "gait cycles per second"),
+    "duration": ("1", "duty factor: share of the cycle that a foot spends in stance"),
+    "swing_height": ("m", "apex of a swing foot above the ground"),
+    "pitch": ("rad", "positive is nose down"),
+    "roll": ("rad", "positive is left side up"),
+    "stance_width": ("m", "between left and right footholds; 0.25 is the robot's own stance"),
+    "stance_length": ("m", "between front and rear footholds; 0.38 is the robot's own stance"),
+    "power_weight": ("1/W", "price of mechanical power in training"),
+    "phase": ("1", "share of a cycle between diagonal pairs of feet: 0.5 in trot"),
+    "offset": ("1", "share of a cycle between front and rear pair: 0.5 in the gait bound"),
+    "bound": ("1", "share of a cycle between left and right pair: 0.5 in pace"),
+}
 CONTINUOUS = tuple(f.name for f in dataclasses.fields(CommandRanges))
-NAMES = (*CONTINUOUS, "phase", "offset", "bound")
-UNITS = (
-    "m/s", "m/s", "rad/s", "m", "Hz", "1", "m", "rad", "rad", "m", "m", "1/W", "1", "1", "1"
-)  # fmt: skip
+NAMES = tuple(COMMANDS)
+UNITS = tuple(unit for unit, _ in COMMANDS.values())
 NUM_ACTIONS = len(CONTINUOUS) + 1  # 12 continuous ones and the gait channel
 NUM_COMMANDS = len(NAMES)
 VELOCITIES = ("vx", "vy", "yaw_rate")  # the first three

@@ -108,9 +108,6 @@ class Relief(NamedTuple):
 _NO_GROUND = np.zeros((1, 1))  # support of families that only stand on or cut into the flat base
 
 
-# One function per family: (section, p(d), rng) -> Relief.
-
-
 def rough(section: Section, amplitude: float, rng: np.random.Generator) -> Relief:
     """h = A n(x, y): bilinear uniform noise, zero-mean with max |n| = 1 where fully blended in."""
     lattice = LATTICES[rng.integers(len(LATTICES))]

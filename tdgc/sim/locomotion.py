@@ -6,6 +6,7 @@ knows nothing about rewards or tasks: ``tdgc.tasks.low_env`` trains the low poli
 ``tdgc.tasks.high_env`` drives it.
 """
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable
@@ -56,21 +57,16 @@ _FREQUENCY = INDEX["frequency"]
 _LATENCY = 0.04  # s, the longest: real robots have about 0.03
 
 
-def check_randomisation(
-    config: RandomisationConfig, physics: PhysicsConfig, trunk_mass: float
-) -> None:
-    """Check that the ranges are physical, and latencies no longer than joint targets are kept for.
-
-    Args:
-        config: the ranges and their ``scale``.
-        physics: provides the nominal friction and the duration of a control step.
-        trunk_mass: kg.
+def check_randomisation(config: RandomisationConfig, world: World) -> None:
+    """Check that the ranges are physical for the robots of ``world``, and latencies no longer than
+    joint targets are kept for.
 
     Raises:
         ConfigError: a range outside what is allowed; the message names the limits.
     """
+    trunk_mass = world.state.geometry.trunk_mass
     allowed = {  # nominal, least and greatest value
-        "friction": (physics.friction, 0.0, np.inf),
+        "friction": (world.physics.friction, 0.0, np.inf),
         "payload": (0.0, -0.9 * trunk_mass, np.inf),  # leave some mass for Bullet
         "motor_strength": (1.0, 0.0, np.inf),
         "latency": (0.0, 0.0, _LATENCY),
@@ -94,11 +90,8 @@ def check_robot(
     Raises:
         ConfigError: an unusable URDF, or a range outside what is allowed; the message says which.
     """
-    world = BulletWorld(1, robot, physics)
-    try:
-        check_randomisation(randomisation, physics, world.state.geometry.trunk_mass)
-    finally:
-        world.close()
+    with contextlib.closing(BulletWorld(1, robot, physics)) as world:
+        check_randomisation(randomisation, world)
 
 
 class Locomotion:
@@ -226,7 +219,7 @@ class Locomotion:
             ConfigError: see ``check_randomisation``.
         """
         n, world = len(index), self.world
-        check_randomisation(config, self.physics, world.state.geometry.trunk_mass)
+        check_randomisation(config, world)
         scale = np.broadcast_to(config.scale * np.asarray(width), n)
 
         def draw(bounds: Range, nominal: float, shape: tuple[int, ...] = (n,)) -> Array:
@@ -317,48 +310,31 @@ class Locomotion:
         self.clock.update(self.command[:, 12:], self.command[:, INDEX["duration"]])
 
 
-def _joint_error(loco: Locomotion) -> Array:
-    return loco.world.state.q - loco.joint_offset - loco.pose()
-
-
-def _command(loco: Locomotion) -> Array:
-    return observed_command(loco.followed())
-
-
-def _gait(loco: Locomotion) -> Array:
-    return gait_index(loco.command)[:, None] / (len(GAITS) - 1)
-
-
-def _pose(loco: Locomotion) -> Array:
-    return loco.pose() - loco.nominal
-
-
 _FLIP_COMMAND = in_place(*(-1.0 if name in SIDEWAYS else 1.0 for name in NAMES))
 # fmt: off
 _ACTOR_LAYOUT: tuple[Term[Locomotion], ...] = (
     Term("gravity", 3, lambda loco: loco.world.state.gravity, 1.0, "noise_gravity", VECTOR_FLIP),
-    Term("joint_error", 12, _joint_error, 1.0, "noise_joint_angle", JOINT_FLIP),
-    Term("pose", 12, _pose, mirror=JOINT_FLIP),
+    Term("joint_error", 12, lambda loco: loco.world.state.q - loco.joint_offset - loco.pose(), 1.0,
+         "noise_joint_angle", JOINT_FLIP),
+    Term("pose", 12, lambda loco: loco.pose() - loco.nominal, mirror=JOINT_FLIP),
     Term("joint_speed", 12, lambda loco: loco.world.state.qd, SPEED_SCALE, "noise_joint_speed",
          JOINT_FLIP),
     Term("last_action", 12, lambda loco: loco.actions[0], mirror=JOINT_FLIP),
     Term("action_before", 12, lambda loco: loco.actions[1], mirror=JOINT_FLIP),
-    Term("command", 15, _command, mirror=_FLIP_COMMAND),
+    Term("command", 15, lambda loco: observed_command(loco.followed()), mirror=_FLIP_COMMAND),
     Term("clock", 4, lambda loco: loco.clock.signal(), mirror=LEG_FLIP),
     Term("clock_cosine", 4, lambda loco: loco.clock.cosine(), mirror=LEG_FLIP),
-    Term("gait", 1, _gait),
+    Term("gait", 1, lambda loco: gait_index(loco.command)[:, None] / (len(GAITS) - 1)),
     Term("gyro", 3, lambda loco: loco.world.state.body_rate, GYRO_SCALE, "noise_gyro", RATE_FLIP),
 )
 # fmt: on
 
 
-# Joint errors from a walking pose do not determine the joint angles, and the sine of a phase does
-# not distinguish the beginning of a stance from its end, so these two terms are added.
-_OF_WALKING = ("pose", "clock_cosine")
-
-
 def actor_layout(robot: RobotConfig, gyro: bool) -> tuple[Term[Locomotion], ...]:
     """Terms of s^L of Sec. IV-A, the actor's observation: 71 values, 3 more with a gyro and 16 more
     with ``robot.commanded_gait``."""
-    absent = (() if gyro else ("gyro",)) + (() if robot.commanded_gait else _OF_WALKING)
-    return tuple(term for term in _ACTOR_LAYOUT if term.name not in absent)
+    # Joint errors from a walking pose do not determine the joint angles, and the sine of a phase
+    # does not distinguish the beginning of a stance from its end, so two terms are added.
+    walks = robot.commanded_gait
+    optional = {"pose": walks, "clock_cosine": walks, "gyro": gyro}
+    return tuple(term for term in _ACTOR_LAYOUT if optional.get(term.name, True))

@@ -271,7 +271,7 @@ def _set(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
         joint.solref_limit = [config.solref, config.dampratio]
 
 
-class Window:
+class Window(contextlib.ExitStack):
     """A ``Watcher`` that shows an episode in MuJoCo's viewer in real time.
 
     Raises:
@@ -279,14 +279,8 @@ class Window:
     """
 
     def __init__(self) -> None:
-        self._open = contextlib.ExitStack()
-
-    def __enter__(self) -> "Window":
         check_display()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._open.close()
+        super().__init__()
 
     def begin(self, batch: Any) -> None:
         from mujoco import viewer
@@ -297,11 +291,11 @@ class Window:
         opened = viewer.launch_passive(
             world.model, world.data, show_left_ui=False, show_right_ui=False
         )
-        self._shown = self._open.enter_context(opened)
+        self._shown = self.enter_context(opened)
         self._shown.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         self._shown.cam.trackbodyid, self._shown.cam.distance = 1, 2.0
 
-    def step(self, step: int, live: NDArray[np.intp], outcome: NDArray[np.int64]) -> None:
+    def step(self, step: int, live: NDArray[np.intp]) -> None:
         if not self._shown.is_running():
             raise WindowError("the window was closed")
         self._shown.sync()

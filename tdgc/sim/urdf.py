@@ -101,11 +101,17 @@ def read_urdf(config: RobotConfig) -> Urdf:
     path = urdf_path(config)
     with named(path):
         try:
-            root = _parse(path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            # Without a document type a file cannot define entities, which could expand without end.
+            if "<!DOCTYPE" in text:
+                raise ConfigError("a URDF has no document type (<!DOCTYPE>)")
+            root = ElementTree.fromstring(text)
         except OSError as error:
             raise ConfigError(str(error.strerror)) from error
         except UnicodeDecodeError as error:
             raise ConfigError("not UTF-8 text") from error
+        except ElementTree.ParseError as error:
+            raise ConfigError(f"not an XML file: {error}") from error
         joints, fixed = _joints(root)
         parts = _parts(root, joints, fixed)
         for own in parts.values():
@@ -232,16 +238,6 @@ def mesh_path(name: str, urdf: Path) -> str:
 
 
 # ---------------------------------------------------------------------------- elements
-
-
-def _parse(text: str) -> Element:
-    # Without a document type a file cannot define entities, which could expand without end.
-    if "<!DOCTYPE" in text:
-        raise ConfigError("a URDF has no document type (<!DOCTYPE>)")
-    try:
-        return ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ConfigError(f"not an XML file: {error}") from error
 
 
 def _joints(robot: Element) -> tuple[dict[str, Element], list[Element]]:
