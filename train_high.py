@@ -36,7 +36,7 @@ from tdgc.files import checksum, make_folder
 from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.imitation import Apprentice, TaughtPolicy
 from tdgc.learn.ppo import LinearRate, check_batch, shared_keywords
-from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, MemoryExchange
+from tdgc.learn.recurrent import FastRecurrentPolicy, FastRecurrentPPO, GaitNoise, exchange_memories
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.vec import TaskVecEnv
 from tdgc.policies import Policy
@@ -202,7 +202,8 @@ def make_learner(
     """
     ppo, exchange = config.ppo, None
     if ppo.memory_exchange:
-        exchange = MemoryExchange(ppo.memory_exchange, untold_column(config.env))
+        untold = untold_column(config.env)
+        exchange = functools.partial(exchange_memories, share=ppo.memory_exchange, untold=untold)
     keywords = {
         "learning_rate": LinearRate(ppo.learning_rate, ppo.final_learning_rate),
         "desired_kl": ppo.desired_kl,
@@ -281,15 +282,10 @@ def begins_hardest(config: HighTrainConfig) -> bool:
 def phases(config: HighTrainConfig, low: Policy, machine: Machine) -> list[Phase]:
     """Return the phases: imitation of the teacher, if any, then reinforcement learning."""
     imitated = min(config.imitation.steps, config.steps)
-    both = (
-        ("imitation", build_imitation, imitated, False),
-        ("learning", build_reinforcement, config.steps, begins_hardest(config)),
-    )
-    return [
-        Phase(name, functools.partial(build, config, low, machine), until, own_levels)
-        for name, build, until, own_levels in both
-        if until > 0
-    ]
+    imitate = functools.partial(build_imitation, config, low, machine)
+    learn = functools.partial(build_reinforcement, config, low, machine)
+    first = [Phase("imitation", imitate, imitated)] if imitated else []
+    return [*first, Phase("learning", learn, config.steps, begins_hardest(config))]
 
 
 def check(config: HighTrainConfig, control_dt: float) -> None:

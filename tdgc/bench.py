@@ -39,7 +39,7 @@ from tdgc.parallel.cluster import CLUSTER_HELP, ActorLink, check_workers, connec
 from tdgc.parallel.cores import auto_workers, usable_cores, workers_flag
 from tdgc.parallel.vec import TaskVecEnv, without_episodes
 from tdgc.parallel.worker import MakeLink, ProcessLink, memory_mb
-from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy
+from tdgc.policies import ACTIVATIONS, AsymmetricActorCriticPolicy, torch_threads
 from tdgc.sim.families import FAMILIES
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
@@ -142,17 +142,13 @@ def learn(config: LowTrainConfig, threads: int, seconds: float) -> float:
         th.autograd.backward((values.square() - log_prob).mean())
         policy.optimizer.step()
 
-    before = th.get_num_threads()
-    th.set_num_threads(threads)
-    try:
+    with torch_threads(threads):
         update()  # not timed: the first update creates the optimiser's state
         started, updates = time.perf_counter(), 0
         while time.perf_counter() - started < seconds:
             update()
             updates += 1
         elapsed = time.perf_counter() - started
-    finally:
-        th.set_num_threads(before)
     return updates * ppo.batch_size / (elapsed * ppo.n_epochs)
 
 

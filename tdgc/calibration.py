@@ -133,7 +133,7 @@ class ResponseModel:
             scaled = self.predictions(self.scaled(th.from_numpy(command))).mean(dim=0)
             return np.asarray((self.zero[:3] + self.unit[:3] * scaled.double()).numpy())
 
-    @policies.one_thread()
+    @policies.torch_threads(1)
     def _fit(self, given: Array, reached: Array, rng: np.random.Generator) -> Array:
         # Robots are dealt to the gaits in turn, so of eight rounds of gaits one is held out. (Those
         # that fell are missing from the rounds.)
@@ -159,7 +159,7 @@ class ResponseModel:
         return np.asarray(np.sqrt(np.mean((self(given[held]) - reached[held]) ** 2, axis=0)))
 
 
-@policies.one_thread()
+@policies.torch_threads(1)
 def learn_correction(response: ResponseModel, seed: int) -> Correction:
     """Learn to correct commands so that robots move as they are asked to, as far as possible.
 

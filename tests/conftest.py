@@ -41,7 +41,7 @@ def signals() -> Iterator[None]:
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """Let PyTorch use one thread: with networks this small, threads only wait for each other."""
-    with policies.one_thread():
+    with policies.torch_threads(1):
         yield
 
 

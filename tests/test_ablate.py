@@ -13,8 +13,8 @@ import train_high
 from tdgc import policies
 from tdgc.ablate import trials
 from tdgc.ablate.__main__ import choose, main, plan, without_missing
-from tdgc.ablate.table import Found, describe, rows
-from tdgc.ablate.trials import Result, Runner, Trial, changed_pair
+from tdgc.ablate.table import describe, rows
+from tdgc.ablate.trials import Found, Result, Runner, Trial, changed_pair
 from tdgc.ablate.variants import HELPS, VARIANTS, WHOLE, Variant, variants
 from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, LowLevelConfig, with_overrides
 from tdgc.learn.recurrent import FastRecurrentPolicy

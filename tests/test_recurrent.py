@@ -1,5 +1,7 @@
 """The fast recurrent learner against sb3-contrib's own: same outputs, gradients and training."""
 
+import functools
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,7 +16,6 @@ from tdgc.learn.recurrent import (
     FastRecurrentPolicy,
     FastRecurrentPPO,
     GaitNoise,
-    MemoryExchange,
     actor_and_critic,
     adapted_share,
     exchange_memories,
@@ -163,7 +164,7 @@ def test_memories_are_exchanged_among_robots_that_are_told_nothing(untold):
     moved = 0
     for _ in range(rounds):
         states = memories(robots)
-        exchange_memories(states, seen, MemoryExchange(0.5, untold))
+        exchange_memories(states, seen, 0.5, untold)
         owner = states.pi[0][0, :, 0]
         for part, state in enumerate(states.pi):
             assert (state[0] == owner[:, None] + 0.25 * part).all()
@@ -177,7 +178,8 @@ def test_memories_are_exchanged_among_robots_that_are_told_nothing(untold):
 
 def test_an_exchange_comes_after_a_rollout_and_changes_none():
     """The next rollout starts from exchanged states, and this one is learned as collected."""
-    model = make_model(FastRecurrentPolicy, learning_rate=0.0, exchange=MemoryExchange(1.0))
+    exchange = functools.partial(exchange_memories, share=1.0)
+    model = make_model(FastRecurrentPolicy, learning_rate=0.0, exchange=exchange)
     collected = []
 
     def remember(values: dict, _) -> bool:

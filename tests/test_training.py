@@ -1098,7 +1098,7 @@ def test_the_learner_is_given_the_imitation_loss_and_the_exchange(
     low = policies.load(PRETRAINED / "low")
     machine = Machine("cpu", 1.0, ProcessLink)
     model, _ = train_high.build_reinforcement(config, low, machine)
-    assert made["policy"] is TaughtPolicy and made["exchange"].share == 0.3
+    assert made["policy"] is TaughtPolicy and made["exchange"].keywords["share"] == 0.3
     assert model.policy.imitation_weight == pytest.approx(0.2 / config.ppo.ent_coef)
 
 

@@ -21,8 +21,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tdgc.ablate.table import Found, describe, rows
-from tdgc.ablate.trials import Runner, Tile, Trial, TrialError
+from tdgc.ablate.table import describe, rows
+from tdgc.ablate.trials import Found, Runner, Tile, Trial
 from tdgc.ablate.variants import Variant, variants
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import InputError, StoppedError, script
@@ -134,10 +134,6 @@ def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Trial]:
 def claim(runner: Runner, tiles: Sequence[Tile]) -> dict[str, Any]:
     """What all trials in the folder have in common, recorded there by the first call.
 
-    Args:
-        runner: of the trials.
-        tiles: that each trial is evaluated on.
-
     Raises:
         InputError: the folder holds trials that cannot be compared with these, or the low policy
             cannot be used.
@@ -215,20 +211,13 @@ def conduct(
         The results of all trials in the folder that were run, now or before; and whether all of
         ``trials`` were run: False after a signal or at the time limit.
     """
-
-    def result(trial: Trial) -> Found:
-        try:
-            return runner.run(trial)
-        except TrialError as error:
-            return str(error)
-
-    found = {trial: result(trial) for trial in finished(runner)}
+    found = {trial: runner.run(trial) for trial in finished(runner)}
     for trial in trials:
         if trial in found:
             continue
         print(f"{trial.name}: {trial.variant.what}", flush=True)
         try:
-            found[trial] = result(trial)
+            found[trial] = runner.run(trial)
         except StoppedError:
             return found, False
         report(runner.out, common, tiles, trials, found)

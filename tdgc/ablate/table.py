@@ -11,12 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from tdgc.ablate.trials import Result, Tile, Trial
+from tdgc.ablate.trials import Found, Result, Tile, Trial
 from tdgc.ablate.variants import WHOLE
 from tdgc.benchmark.intervals import difference, rates
-
-#: The result of a trial, or its error message.
-Found = Result | str
 
 
 def rows(

@@ -70,6 +70,10 @@ class Result:
     reached: NDArray[np.bool_]
 
 
+#: The result of a trial, or its error message.
+Found = Result | str
+
+
 @dataclass(frozen=True)
 class Runner:
     """Runs trials that can be compared with each other.
@@ -96,11 +100,12 @@ class Runner:
     workers: Workers
     deadline: float | None
 
-    def run(self, trial: Trial) -> Result:
+    def run(self, trial: Trial) -> Found:
         """Train a trial, if it needs training, and evaluate it; continue from an earlier call.
 
+        Returns its result, or an error message if it failed or one of its files is damaged.
+
         Raises:
-            TrialError: it failed, or one of its files is damaged.
             StoppedError: a signal or the deadline came before it was done.
         """
         folder = self.out / trial.name
@@ -116,10 +121,10 @@ class Runner:
         except StoppedError:
             raise
         except (ValueError, *FAILURES) as error:
-            raise TrialError(what_stopped(error)) from error
+            said = what_stopped(error)
         except Exception as error:  # whatever happened, the other trials continue
-            said = " ".join(str(error).split())
-            raise TrialError(f"{type(error).__name__}: {said}") from error
+            said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return str(TrialError(said))  # on one line, of printable characters
 
     def done(self, trial: Trial) -> bool:
         """Whether an earlier call has finished the trial."""

@@ -11,7 +11,7 @@ encoders and LSTMs see padding, and only where an episode starts within the roll
 
 import functools
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -52,25 +52,6 @@ class GaitNoise:
     robots: int
     gaits: int
     hold: int = 1
-
-
-@dataclass(frozen=True)
-class MemoryExchange:
-    """Exchange of hidden states between robots after each rollout.
-
-    A training tile is of one family throughout, so a hidden state that has seen pillars never meets
-    a trench, and a policy learns to expect none. With the hidden state of a robot on other ground
-    it has to act on what it sees.
-
-    Attributes:
-        share: of the robots that take part, drawn anew after each rollout.
-        untold: column of the observation that is 1 where a robot is not told its family. Only such
-            robots take part, because the others know their family from the observation. None if
-            no robot is told its family; then all can take part.
-    """
-
-    share: float
-    untold: int | None = None
 
 
 class FastRecurrentPolicy(RecurrentActorCriticPolicy):
@@ -262,21 +243,25 @@ def gait_entropy(mean: th.Tensor, std: th.Tensor, limit: float, gaits: int) -> t
 
 
 def exchange_memories(
-    states: RNNStates, seen: NDArray[np.float32], exchange: MemoryExchange
+    states: RNNStates, seen: NDArray[np.float32], share: float, untold: int | None = None
 ) -> None:
     """Shuffle the actor's hidden states of a random subset of the robots among them, in place.
 
-    The critic keeps its own: it is to value what the robot will meet.
+    A training tile is of one family throughout, so a hidden state that has seen pillars never meets
+    a trench, and a policy learns to expect none. With the hidden state of a robot on other ground
+    it has to act on what it sees. The critic keeps its own: it is to value what the robot will
+    meet.
 
     Args:
         states: of actor and critic, each (1, M, hidden).
         seen: (M, size), the robots' observations.
-        exchange: which robots take part.
+        share: of the robots that take part, drawn anew in each call.
+        untold: column of the observation that is 1 where a robot is not told its family. Only such
+            robots take part, because the others know their family from the observation. None if
+            no robot is told its family; then all can take part.
     """
-    untold = np.arange(len(seen))
-    if exchange.untold is not None:
-        untold = np.flatnonzero(seen[:, exchange.untold] > 0.5)
-    some = untold[np.random.random(len(untold)) < exchange.share]
+    some = np.arange(len(seen)) if untold is None else np.flatnonzero(seen[:, untold] > 0.5)
+    some = some[np.random.random(len(some)) < share]
     others = np.random.permutation(some)
     for state in states.pi:
         state[:, some] = state[:, others]
@@ -311,21 +296,11 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
         states = self.first_memories()
         for drawn in np.array_split(np.random.permutation(self.n_envs), minibatches):
             envs = self.to_torch(drawn)
-            obs, actions, values, log_probs, advantages, returns, starts = (
-                array.index_select(0, envs).flatten(0, 1) for array in steps
-            )
+            *parts, starts = (array.index_select(0, envs).flatten(0, 1) for array in steps)
             h_pi, c_pi, h_vf, c_vf = states.index_select(2, envs)
-            yield RecurrentRolloutBufferSamples(
-                observations=obs,
-                actions=actions,
-                old_values=values,
-                old_log_prob=log_probs,
-                advantages=advantages,
-                returns=returns,
-                lstm_states=RNNStates((h_pi, c_pi), (h_vf, c_vf)),
-                episode_starts=starts,
-                mask=cast(th.Tensor, _Everything()),
-            )
+            memories = RNNStates((h_pi, c_pi), (h_vf, c_vf))
+            # In the order of the fields.
+            yield RecurrentRolloutBufferSamples._make((*parts, memories, starts, _Everything()))
 
     def by_env(self, array: NDArray[np.float32]) -> th.Tensor:
         """Swap axes: array (n_steps, n_envs, ...) -> tensor (n_envs, n_steps, ...)."""
@@ -333,14 +308,9 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
 
     def first_memories(self) -> th.Tensor:
         """h and c of the actor and the critic before the first step, (4, 1, n_envs, hidden)."""
-        first = [
-            array[0]
-            for array in (
-                self.hidden_states_pi, self.cell_states_pi,
-                self.hidden_states_vf, self.cell_states_vf,
-            )
-        ]  # fmt: skip
-        return self.to_torch(np.stack(first))
+        of_actor = self.hidden_states_pi[0], self.cell_states_pi[0]
+        of_critic = self.hidden_states_vf[0], self.cell_states_vf[0]
+        return self.to_torch(np.stack([*of_actor, *of_critic]))
 
 
 def actor_and_critic(policy: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
@@ -377,7 +347,8 @@ class FastRecurrentPPO(RecurrentPPO):
     Args:
         gait_ent_coef: weight of the gaits' entropy (``GaitNoise``) in the loss at the first step;
             it falls linearly to zero at the last. It requires an ``ent_coef`` above 0.
-        exchange: exchange of hidden states after each rollout; None for no exchange.
+        exchange: exchanges hidden states after each rollout, see ``exchange_memories``; None for no
+            exchange.
         desired_kl: KL divergence of the policy after an update from that before; the actor's
             learning rate is a share of ``learning_rate``, lowered after an update beyond twice
             this, see ``adapted_share``. None: the actor learns at ``learning_rate``, as the critic
@@ -391,7 +362,7 @@ class FastRecurrentPPO(RecurrentPPO):
         self,
         *args: Any,
         gait_ent_coef: float = 0.0,
-        exchange: MemoryExchange | None = None,
+        exchange: Callable[[RNNStates, NDArray[np.float32]], None] | None = None,
         desired_kl: float | None = None,
         **kwargs: Any,
     ) -> None:
@@ -403,7 +374,7 @@ class FastRecurrentPPO(RecurrentPPO):
         complete = super().collect_rollouts(*args, **kwargs)
         if self.exchange is not None:
             seen = cast(NDArray[np.float32], self._last_obs)
-            exchange_memories(cast(RNNStates, self._last_lstm_states), seen, self.exchange)
+            self.exchange(cast(RNNStates, self._last_lstm_states), seen)
         return complete
 
     def train(self) -> None:

@@ -108,26 +108,20 @@ class Arrays:
     """The arrays of some robots, in memory shared with every process they are passed to."""
 
     def __init__(self, num: int, obs_dim: int, action_dim: int) -> None:
-        self._shape = (num, obs_dim, action_dim)
-        self._raw = {
-            "actions": RawArray("f", num * action_dim),
-            "obs": RawArray("f", num * obs_dim),
-            "last_obs": RawArray("f", num * obs_dim),
-            "rewards": RawArray("f", num),
-            "terminated": RawArray("b", num),
-            "truncated": RawArray("b", num),
+        self._raw = {  # name -> memory, shape
+            "actions": (RawArray("f", num * action_dim), (num, action_dim)),
+            "obs": (RawArray("f", num * obs_dim), (num, obs_dim)),
+            "last_obs": (RawArray("f", num * obs_dim), (num, obs_dim)),
+            "rewards": (RawArray("f", num), (num,)),
+            "terminated": (RawArray("b", num), (num,)),
+            "truncated": (RawArray("b", num), (num,)),
         }
 
     def views(self, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
         """Views of ``rows``: actions, obs, last_obs (of ended episodes), rewards, the two flags."""
-        num, obs_dim, action_dim = self._shape
-        width = {"actions": action_dim, "obs": obs_dim, "last_obs": obs_dim}
-        views: dict[str, NDArray[Any]] = {}
-        for name, raw in self._raw.items():
-            dtype = np.float32 if name in (*width, "rewards") else np.int8
-            flat: NDArray[Any] = np.frombuffer(raw, dtype=dtype)
-            views[name] = (flat.reshape(num, width[name]) if name in width else flat)[rows]
-        return views
+        return {
+            name: np.asarray(raw).reshape(shape)[rows] for name, (raw, shape) in self._raw.items()
+        }
 
 
 class Beginning(NamedTuple):

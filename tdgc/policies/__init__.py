@@ -7,7 +7,7 @@ access.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tdgc.policies.acting import Actor, Policy, State, load, one_thread, save_copy
+from tdgc.policies.acting import Actor, Policy, State, load, save_copy, torch_threads
 from tdgc.policies.correction import Correction
 from tdgc.policies.files import ACTIVATIONS, Header, Mirror, PolicyFileError
 
@@ -26,9 +26,9 @@ __all__ = [
     "State",
     "load",
     "load_into",
-    "one_thread",
     "save",
     "save_copy",
+    "torch_threads",
 ]
 
 

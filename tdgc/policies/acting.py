@@ -118,7 +118,7 @@ class Policy:
         """
         if self.correction is None:
             return commands
-        with one_thread(), th.inference_mode():
+        with torch_threads(1), th.inference_mode():
             return np.asarray(self.correction(th.tensor(commands)).numpy())
 
     def predict(
@@ -152,7 +152,7 @@ class Policy:
                 f"(actor part) or {self.obs_dim} (all)"
             )
         batch: Array = np.array(np.atleast_2d(x)[:, : self.actor_dim], dtype=np.float32)
-        with one_thread(), th.inference_mode():
+        with torch_threads(1), th.inference_mode():
             latent = th.from_numpy(batch)
             if self.state_size:
                 before = self._previous(state, episode_start, len(batch), self.state_size)
@@ -204,18 +204,18 @@ class Policy:
 
 
 @contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Run PyTorch on one thread, as a context manager or a decorator.
+def torch_threads(number: int) -> Iterator[None]:
+    """Run PyTorch on ``number`` threads, as a context manager or a decorator.
 
     The networks are too small to parallelise: one thread costs nothing when cores are idle, is
     several times faster when they are busy, and gives the same bits whatever the thread setting.
     """
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
+    before = th.get_num_threads()
+    th.set_num_threads(number)
     try:
         yield
     finally:
-        th.set_num_threads(threads)
+        th.set_num_threads(before)
 
 
 def load(path: str | os.PathLike[str]) -> Policy:
