@@ -750,6 +750,30 @@ def test_the_sensors_noise_reaches_the_low_policy(monkeypatch):
     assert given[0] is not None and given[1] is None
 
 
+def test_a_robot_that_blows_up_spoils_its_cell(low, monkeypatch):
+    """Its position is not finite; neighbours would fall through the ground from now on."""
+
+    class Burst(BaselineDriver):
+        def begin(self, loco, *rest):
+            super().begin(loco, *rest)
+            loco.world.strength[1] = np.nan
+
+    monkeypatch.setattr(evaluation, "HORIZON", 0.2)
+    with np.errstate(invalid="ignore"):
+        with pytest.raises(FloatingPointError, match=r"^Cell\(.*position is not finite$"):
+            run_cell(Cell("gp", "nominal", "rough", 0, 0, 2), low, Burst(), 5)
+        with pytest.raises(FloatingPointError, match="diverged"):
+            for loco in tracking.walk_on_plane(low, 2, 0.2, 0):
+                loco.world.strength[0] = np.nan
+
+
+def test_the_tracking_table_names_each_gaits_result(monkeypatch):
+    monkeypatch.setattr(tracking, "track_gait", lambda low, gait, n, seed: {"of": (gait, n, seed)})
+    monkeypatch.setattr(tracking, "count_falls", lambda low, n, seed: {"falls": (n, seed)})
+    found = tracking.tracking(None, 10, 4, 1, lambda work, jobs, workers: map(work, jobs))
+    assert found == {"gaits": {g: {"of": (g, 10, 4)} for g in GAITS}, "falls": (6, 4)}
+
+
 def test_the_path_is_what_was_walked():
     low, config = load_low(PRETRAINED / "low")
     batch = Batch(Cell("gp", "nominal", "rough", 0, 0, 2), config, 0)

@@ -80,6 +80,9 @@ class Notes:
                     "q": state.q[1].copy(),
                     "command": self._loco.carried_out[1].copy(),
                     "contact": state.foot_force[1] > 1.0,
+                    "desired": self._loco.clock.contact[1] > 0.5,
+                    "quaternion": state.quaternion[1].copy(),
+                    "velocity": np.append(state.heading_vel[1, :2], state.ang_vel[1, 2]),
                 }
             )
 
@@ -97,7 +100,7 @@ def test_a_recording_is_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     assert second.outcome == watched[1].outcome == "timeout" and second.ending == "timeout, 0.4 s"
     assert len(second.command) == 20
     assert second.command[0, INDEX["frequency"]] == pytest.approx(3.5)  # as a gait begins
-    for key in ("position", "q", "command", "contact"):
+    for key in notes.rows[0]:
         assert np.array_equal(getattr(second, key), [row[key] for row in notes.rows]), key
     assert second.contact.any() and second.desired.any() and not second.contact.all()
     # The recorded speed over ground, in any direction, fits the change of position.
@@ -350,3 +353,23 @@ def test_flags_that_cannot_be_used(
 ) -> None:
     assert evaluate.main(flags) == 2
     assert capsys.readouterr().err == f"evaluate.py: {message}\n"
+
+
+def test_what_cannot_be_drawn_is_a_line_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The table, and what can be drawn, are there all the same."""
+
+    def full(*_: Any) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(film, "film", full)
+    monkeypatch.setattr(evaluate.report, "write", full)
+    assert evaluate_short(tmp_path, monkeypatch, "--video", "--policies", "gp") == 1
+    said = capsys.readouterr().err.splitlines()
+    assert [line for line in said if line.startswith("evaluate.py")] == [
+        "evaluate.py: no film of gp_nominal_gap_10_000: No space left on device",
+        "evaluate.py: no report.html: No space left on device",
+    ]
+    assert (tmp_path / "films" / "strip_gap_10.png").is_file()
+    assert (tmp_path / "summary.json").is_file()

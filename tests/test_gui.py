@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 
 import evaluate
+from tdgc.benchmark import evaluation
+from tdgc.benchmark.drivers import BaselineDriver
+from tdgc.benchmark.evaluation import Cell, tile_of
 from tdgc.config import ConfigError
+from tdgc.show import gui
 from tdgc.show.gui import describe, slider_command
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.display import WindowError, check_display
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
+from tdgc.sim.robot import Array
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
 
@@ -57,3 +62,59 @@ def test_no_display(
     assert evaluate.main(["--gui", mode, *driver]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("evaluate.py: a window needs ")
+
+
+class Pane:
+    """Stands in for Bullet's window; it is closed after the last of the sliders' ``values``."""
+
+    def __init__(self, values: list[Array]) -> None:
+        self._values = iter(values)
+        self.sliders: list[str] = []
+        self.seen: list[Array] = []
+        self.texts: list[str] = []
+        self.closed = False
+
+    def add_slider(self, name: str, low: float, high: float, start: float) -> None:
+        self.sliders.append(name)
+
+    def read_sliders(self) -> Array:
+        for values in self._values:
+            return values
+        raise WindowError("the window was closed")
+
+    def show(self, position: Array, quaternion: Array, q: Array) -> None:
+        self.seen.append(position.copy())
+
+    def follow(self, text: str) -> None:
+        self.texts.append(text)
+        if text == "timeout":
+            raise WindowError("the window was closed")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_the_button_puts_the_robot_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot walks ahead for a second; closing the window is the normal end."""
+    ahead = np.append(default_command()[:12], [0.0, 0.0])  # trot; the button is not pressed
+    ahead[INDEX["vx"]] = 0.6
+    pressed = np.append(ahead[:-1], 1.0)
+    pane = Pane([ahead] * 50 + [pressed])
+    monkeypatch.setattr(gui, "set_stage", lambda *_, **__: pane)
+    monkeypatch.setattr(gui.time, "sleep", lambda _: None)
+    gui.drive(load_low(PRETRAINED / "low")[0], Cell("gp", "nominal", "rough", 0, 0, 1), 0)
+    x, y, _ = tile_of(0, "rough", 0, 0).start
+    away = [np.hypot(place[0] - x, place[1] - y) for place in pane.seen]
+    assert len(away) == 51 and away[49] > 0.2 and away[50] < 0.01
+    assert pane.sliders[0] == "vx (m/s)" and len(pane.sliders) == 14 and pane.closed
+
+
+def test_watching_shows_the_episode_and_then_its_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluation, "HORIZON", 0.3)
+    pane = Pane([])
+    monkeypatch.setattr(gui, "set_stage", lambda *_, **__: pane)
+    monkeypatch.setattr(gui.time, "sleep", lambda _: None)
+    low = load_low(PRETRAINED / "low")[0]
+    gui.watch(low, BaselineDriver(), Cell("gp", "nominal", "rough", 0, 0, 1), 0)
+    assert len(pane.seen) == 15 and pane.closed
+    assert pane.texts[0].startswith("trot, vx 0.") and pane.texts[-1] == "timeout"

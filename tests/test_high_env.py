@@ -769,3 +769,12 @@ def test_success_is_of_the_episodes_that_the_policy_drove():
 def test_nothing_is_logged_of_a_family_without_robots():
     values = summarise_high({"family/stair/count": 0.0, "family/stair/level": 0.0})
     assert set(values) == {"reward/total"}
+
+
+def test_info_says_whether_the_goal_is_reached():
+    env = gym.make("tdgc/Navigation-v0").unwrapped
+    env.reset(seed=0)
+    assert env.step(np.zeros(13, np.float32))[4] == {"is_success": False}
+    env.task.goal[:] = env.task.world.state.position[:, :2]
+    assert env.step(np.zeros(13, np.float32))[4] == {"is_success": True}
+    env.close()

@@ -80,6 +80,14 @@ def test_success_figure_with_rates_of_none_and_all(tmp_path: Path) -> None:
     assert three.shape[0] > 2.5 * one.shape[0] - 200  # one row of panels per condition
 
 
+def test_success_figure_shows_the_rates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path)
+    figures = drawn(monkeypatch)
+    plots.success_by_level(tmp_path / "summary.json", tmp_path / "one.png")
+    rates = {c.get_label(): c.lines[0].get_ydata().tolist() for c in figures[0].axes[0].containers}
+    assert rates == {"tdgc": [100.0, 100.0], "gp": [0.0, 0.0]}
+
+
 def test_gait_figure_is_half_and_half(tmp_path: Path) -> None:
     """``tdgc`` only trots in one family and only pronks in the other; ``gp`` only trots."""
     plots.gait_shares(write(tmp_path), tmp_path / "gaits.png")
@@ -163,13 +171,19 @@ def test_figures_of_another_condition_say_so(
     assert [figure.get_suptitle() for figure in figures] == ["", "condition pushes"]
 
 
-def test_training_figure_skips_what_a_phase_does_not_log(tmp_path: Path) -> None:
+def test_training_figure_skips_what_a_phase_does_not_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plane = {"steps": 100_000, "reward/total": 0.001, "tracking/trot_contact_match": 0.5}
     tiles = {"steps": 200_000, "reward/total": 0.002, "level/stair": 1.5}
     log = tmp_path / "log.jsonl"
     log.write_text(f"{json.dumps(plane)}\n{json.dumps(tiles)}\n", encoding="utf-8")
     plots.training_curve(log, tmp_path / "training.png")
     assert matplotlib.image.imread(tmp_path / "training.png").shape[2] == 4
+    figures = drawn(monkeypatch)
+    plots.training_curve(log, tmp_path / "training.png")
+    lines = [[line.get_xydata().tolist() for line in axis.lines] for axis in figures[0].axes]
+    assert lines == [[[[0.1, 0.001], [0.2, 0.002]]], [], [], [[[0.1, 0.5]]], [], [[[0.2, 1.5]]]]
 
 
 def test_decision_figure_marks_the_end_of_imitation(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from tdgc.sim.commands import CONTINUOUS, INDEX, NAMES, CommandDecoder
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
+from tdgc.tasks.low_rewards import commanded_gravity
 from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 
@@ -53,6 +54,8 @@ class Notes(Tracer):
             "lin_vel": s.lin_vel.copy(),
             "velocity": s.heading_vel.copy(),
             "turn": s.ang_vel[:, 2].copy(),
+            "gravity": s.gravity.copy(),
+            "height": loco.world.trunk_height(),
             "touch": s.foot_force > 1.0,
             "wanted": loco.clock.contact > 0.5,
             "probes": height_probes(loco, PROBES[HighLevelConfig().probes]),
@@ -183,8 +186,9 @@ def test_cues_are_those_of_the_condition(low, watched_high):
     assert set(t["family"]) == {"unknown"}
 
 
-def test_execution_is_measured_since_the_decision_before(watched):
+def test_execution_is_measured_since_the_decision_before(watched, low):
     notes, traces, _ = watched
+    standing = low[1].robot.base_height
     for k, t in enumerate(traces):
         assert np.isnan(t["error_vx"][0]) and np.isnan(t["power"][0])
         for decision in range(11):
@@ -196,6 +200,13 @@ def test_execution_is_measured_since_the_decision_before(watched):
                 assert row[f"error_{name}"] == pytest.approx(expected, abs=1e-6)
             expected = np.mean(turn - command[:, INDEX["yaw_rate"]])
             assert row["error_yaw_rate"] == pytest.approx(expected, abs=1e-6)
+            gx, gy, gz = notes.over(decision, "gravity", k).T
+            height = notes.over(decision, "height", k) - standing
+            for name, values in (
+                ("pitch", np.arcsin(gx)), ("roll", np.arctan2(-gy, -gz)), ("body_height", height)
+            ):  # fmt: skip
+                expected = np.mean(values - command[:, INDEX[name]])
+                assert row[f"error_{name}"] == pytest.approx(expected, abs=1e-6)
             touch, wanted = notes.over(decision, "touch", k), notes.over(decision, "wanted", k)
             for f, foot in enumerate(FEET):
                 assert row[f"contact_{foot}"] == pytest.approx(touch[:, f].mean())
@@ -206,15 +217,9 @@ def test_execution_is_measured_since_the_decision_before(watched):
             assert row["power"] == pytest.approx(notes.over(decision, "power", k).mean(), rel=1e-5)
 
 
-def test_tilt_and_height_are_errors_of_their_commands(low):
-    """A baseline asks for a level trunk at one height, so the errors are the pose."""
-    driver = BaselineDriver()
-    cell = Cell("gp", "nominal", "tilt", 10, 0, 1)
-    _, (t,), _ = watch(driver, cell, low[0])
-    assert t["error_roll"][1:] == pytest.approx(t["roll"][1:], abs=0.1)
-    assert t["error_pitch"][1:] == pytest.approx(t["pitch"][1:], abs=0.1)
-    height = t["base_height"][1:] - low[1].robot.base_height - driver.body_height
-    assert t["error_body_height"][1:] == pytest.approx(height, abs=0.03)
+def test_tilt_undoes_commanded_gravity():
+    pitch, roll = np.array([0.3, -0.2]), np.array([-0.1, 0.2])
+    np.testing.assert_allclose(trace.tilt(commanded_gravity(pitch, roll)), [pitch, roll])
 
 
 def test_energy_of_an_episode_is_its_power_over_time(watched):
