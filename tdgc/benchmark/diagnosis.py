@@ -257,17 +257,12 @@ def held_up(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
 def free(trace: Trace, tile: Tile | None, hips: float) -> NDArray[np.bool_]:
     """Mask of the intervals, (n - 1,), in which tracking is judged.
 
-    Against an obstacle or over the edge of the tile no policy can track its commands.
+    No policy can track its commands against an obstacle, or with the trunk within ``hips`` m of the
+    tile's edge, where feet have no ground.
     """
-    return ~(held_up(trace, tile, hips) | near_edge(trace, hips))[1:]
-
-
-def near_edge(trace: Trace, hips: float) -> NDArray[np.bool_]:
-    """Mask of the rows, (n,), in which the trunk is within ``hips`` m of the tile's edge, where
-    feet have no ground."""
     x, y = trace["base_x"], trace["base_y"]
     inside = np.minimum(np.minimum(x, TILE_SIZE - x), np.minimum(y, TILE_SIZE - y))
-    return inside < hips
+    return ~(held_up(trace, tile, hips) | (inside < hips))[1:]
 
 
 def _evidence(

@@ -93,6 +93,11 @@ def _of(runs: Sequence[_Run], policy: str, family: str) -> list[_Run]:
     return [r for r in runs if (r.row["policy"], r.row["family"]) == (policy, family)]
 
 
+def _panels(rows: int, columns: int, size: tuple[float, float], **more: Any) -> tuple[Figure, Any]:
+    """A figure of ``size`` (width, height) in inches with axes (rows, columns)."""
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **more)
+
+
 def success_by_level(summary: Path, out: Path) -> None:
     """Plot success with 95 % intervals by level, from summary.json.
 
@@ -102,14 +107,8 @@ def success_by_level(summary: Path, out: Path) -> None:
     first = next(iter(table.values()))  # every policy is run in the same cells
     families = {name: [f for f in rates if f != "mean"] for name, rates in first.items()}
     columns = max(map(len, families.values()))
-    figure, axes = plt.subplots(
-        len(families),
-        columns,
-        figsize=(1.4 + 2.0 * columns, 0.6 + 2.2 * len(families)),
-        sharey=True,
-        squeeze=False,
-        layout="constrained",
-    )
+    size = 1.4 + 2.0 * columns, 0.6 + 2.2 * len(families)
+    figure, axes = _panels(len(families), columns, size, sharey=True)
     for row, (condition, names) in zip(axes, families.items(), strict=True):
         row[0].set_ylabel(f"{condition}\nsuccess (%)")
         for axis, family in zip(row, names, strict=False):
@@ -142,14 +141,8 @@ def gait_shares(folder: Path, out: Path) -> None:
     """Plot the share of time in each gait by family, with a panel per policy."""
     runs = _read(folder)
     names, families = _names(runs, "policy"), _names(runs, "family")
-    figure, axes = plt.subplots(
-        1,
-        len(names),
-        figsize=(1.2 + 4.2 * len(names), 1.2 + 0.45 * len(families)),
-        sharey=True,
-        squeeze=False,
-        layout="constrained",
-    )
+    size = 1.2 + 4.2 * len(names), 1.2 + 0.45 * len(families)
+    figure, axes = _panels(1, len(names), size, sharey=True)
     for axis, policy in zip(axes[0], names, strict=True):
         for y, family in enumerate(families):
             rows = [run.row for run in _of(runs, policy, family)]
@@ -188,14 +181,8 @@ def headings(folder: Path, out: Path) -> None:
     """Plot headings relative to the direction of travel, by policy (rows) and family (columns)."""
     runs = _read(folder)
     names, families = _names(runs, "policy"), _names(runs, "family")
-    figure, axes = plt.subplots(
-        len(names),
-        len(families),
-        figsize=(0.6 + 2.4 * len(families), 0.7 + 2.5 * len(names)),
-        squeeze=False,
-        subplot_kw={"projection": "polar"},
-        layout="constrained",
-    )
+    size = 0.6 + 2.4 * len(families), 0.7 + 2.5 * len(names)
+    figure, axes = _panels(len(names), len(families), size, subplot_kw={"projection": "polar"})
     width = 2 * np.pi / _SECTORS
     edges = np.linspace(-np.pi, np.pi, _SECTORS + 1) + 0.5 * width  # centre a sector straight ahead
     for row, policy in zip(axes, names, strict=True):
@@ -234,15 +221,8 @@ def trajectories(folder: Path, out: Path) -> None:
         hardest[run.row["family"]] = max(hardest[run.row["family"]], int(run.row["level"]))
     runs = [run for run in runs if int(run.row["level"]) == hardest[run.row["family"]]]
     columns = len(runs) // len(hardest)
-    figure, axes = plt.subplots(
-        len(hardest),
-        columns,
-        figsize=(1.6 + 2.1 * columns, 0.9 + 2.3 * len(hardest)),
-        sharex=True,
-        sharey=True,
-        squeeze=False,
-        layout="constrained",
-    )
+    size = 1.6 + 2.1 * columns, 0.9 + 2.3 * len(hardest)
+    figure, axes = _panels(len(hardest), columns, size, sharex=True, sharey=True)
     for row, (family, level) in zip(axes, hardest.items(), strict=True):
         mine = [run for run in runs if run.row["family"] == family]
         tiles = [
