@@ -13,9 +13,12 @@ from stubs import InlineLink, in_this_process
 
 import evaluate
 from tdgc import policies
+from tdgc.config import LowLevelConfig
 from tdgc.learn.run import signals_restored
+from tdgc.policies import Policy
 from tdgc.show import film
 from tdgc.tasks import leaps
+from tdgc.tasks.pairing import PRETRAINED, load_low
 
 #: The slowest files, slowest first. Run in this order, no process is left without work at the end.
 SLOWEST = (
@@ -29,6 +32,12 @@ ORDER = {f"test_{name}.py": place for place, name in enumerate(SLOWEST)}
 def sb3_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Let Stable-Baselines3's default logger use one folder, not a new one in /tmp per learner."""
     os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
+
+
+@pytest.fixture(scope="session")
+def low() -> tuple[Policy, LowLevelConfig]:
+    """The shipped low policy and its MDP."""
+    return load_low(PRETRAINED / "low")
 
 
 @pytest.fixture

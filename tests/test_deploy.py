@@ -155,8 +155,7 @@ def test_fields_that_do_not_fit_are_refused_in_one_line(
     folder: Path, tmp_path: Path, name: str, path: str, value: Any, message: str
 ) -> None:
     """The field at a path set to another value, or removed."""
-    for file in folder.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     file = tmp_path / f"{name}_interface.json"
     inner = table = json.loads(file.read_text())
     *above, last = (int(key) if key.isdigit() else key for key in path.split())
@@ -317,8 +316,7 @@ def test_it_stands_after_the_goal_and_after_the_horizon(controller: Controller) 
 
 def test_the_high_policy_stops_after_the_goal_never_before(folder: Path, tmp_path: Path) -> None:
     """Also if it is to stop as soon as the goal is reached."""
-    for path in folder.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     path = tmp_path / "high_interface.json"
     for seconds, steps in ((2.0, 100), (3 * 0.1, 15), (0.0, 0)):
         table = json.loads(path.read_text())
@@ -331,8 +329,7 @@ def test_the_high_policy_stops_after_the_goal_never_before(folder: Path, tmp_pat
 
 
 def test_a_graph_that_is_not_the_exports_is_refused(folder: Path, tmp_path: Path) -> None:
-    for path in folder.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     with pytest.raises(ExportError, match=r"its low policy was exported as torchscript, not onnx$"):
         Controller(tmp_path, "onnx")
     graph = tmp_path / "high.pt"
@@ -672,11 +669,16 @@ def test_each_value_is_compared_with_the_graphs(
     assert log.replay(found, controller)["decision"] == (pytest.approx(0.004), np.inf)
 
 
-def test_what_differs_from_the_graphs_is_named(
-    folder: Path, walk: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+@pytest.fixture
+def torch_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let tdgc.diagnose run TorchScript graphs, which these tests have exported."""
     monkeypatch.setattr(diagnose, "Controller", functools.partial(Controller, form=FORM))
+
+
+@pytest.mark.usefixtures("torch_graphs")
+def test_what_differs_from_the_graphs_is_named(
+    folder: Path, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
     commands = np.full((12, 15), 0.123)
     path = changed(walk, tmp_path, commands=commands)
     flags = ["--export", str(folder), "--outcome", "fell", "--out", str(tmp_path)]
@@ -687,11 +689,11 @@ def test_what_differs_from_the_graphs_is_named(
     assert "joint_targets" not in said and said.count("\n") == 1
 
 
+@pytest.mark.usefixtures("torch_graphs")
 def test_a_reached_goal_leaves_no_older_diagnosis(
     folder: Path, walk: Path, arrival: tuple[Path, list[int]], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(diagnose, "Controller", functools.partial(Controller, form=FORM))
     flags = ["--export", str(folder), "--out", str(tmp_path)]
     assert diagnose.main([str(walk), *flags, "--outcome", "fell"]) == 0
     assert (tmp_path / "diagnosis.csv").is_file()
@@ -723,16 +725,15 @@ def damaged(walk: Path, out: Path, kind: str) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("torch_graphs")
 @pytest.mark.parametrize(
     "kind",
     ["truncated", "flipped", "one array", "CSV of nothing", "CSV without rows",
      "CSV of longer rows"],
 )  # fmt: skip
 def test_a_damaged_log_is_one_line(
-    kind: str, folder: Path, walk: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    kind: str, folder: Path, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(diagnose, "Controller", functools.partial(Controller, form=FORM))
     out, flags = tmp_path / "out", ["--export", str(folder), "--outcome", "fell"]
     assert diagnose.main([str(walk), *flags, "--out", str(out)]) == 0
     assert (out / "diagnosis.csv").is_file()
@@ -747,11 +748,10 @@ def test_a_damaged_log_is_one_line(
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.usefixtures("torch_graphs")
 def test_a_diagnosis_that_cannot_be_written_is_one_line(
-    folder: Path, walk: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    folder: Path, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(diagnose, "Controller", functools.partial(Controller, form=FORM))
     (tmp_path / "diagnosis.csv").mkdir()
     flags = ["--export", str(folder), "--outcome", "fell", "--out", str(tmp_path)]
     assert diagnose.main([str(walk), *flags]) == 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -25,17 +24,13 @@ from tdgc.benchmark.drivers import BaselineDriver, HierarchyDriver, TeacherDrive
 from tdgc.benchmark.evaluation import Cell, Episode, run_cell, tile_of
 from tdgc.benchmark.planted import Blindfold, SwappedBounds, WeakMotor, measured_limits
 from tdgc.benchmark.trace import COLUMNS, Trace, Tracer
+from tdgc.files import read_csv
 from tdgc.tasks.leaps import Landing
-from tdgc.tasks.pairing import PRETRAINED, load_low
+from tdgc.tasks.pairing import PRETRAINED
 from tdgc.tasks.probes import NUM_PROBES
 from tdgc.tasks.teacher import Skill
 
 HIPS = 0.183  # m ahead of the trunk's centre, of the shipped robot
-
-
-@pytest.fixture(scope="module")
-def low():
-    return load_low(PRETRAINED / "low")
 
 
 @pytest.fixture(scope="module")
@@ -382,9 +377,8 @@ def test_rows_are_written_as_they_are(tmp_path: Path):
     path = tmp_path / "diagnosis.csv"
     rows = [diagnose(walk(), HIPS), diagnose(walk("gap", outcome="fell"), HIPS)]
     diagnosis.write(rows, path)
-    with open(path, newline="", encoding="utf-8") as file:
-        read = list(csv.DictReader(file))
-    assert read == [{k: str(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
+    expected = [{k: str(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
+    assert read_csv(path) == expected
     diagnosis.write([], path)
     header = ",".join(f.name for f in dataclasses.fields(Diagnosis))
     assert path.read_text(encoding="utf-8").splitlines() == [header]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -81,9 +83,13 @@ def save_high(
     return path
 
 
-@pytest.fixture(scope="module")
-def low() -> tuple[Policy, LowLevelConfig]:
-    return load_low(LOW)
+@pytest.fixture
+def loco(low) -> Iterator[Locomotion]:
+    """A robot at the origin of a plane."""
+    with closing(BulletWorld(1, low[1].robot, low[1].physics)) as world:
+        loco = Locomotion(world, low[1])
+        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+        yield loco
 
 
 # ------------------------------------------------------------------ gp
@@ -98,20 +104,14 @@ def test_toward_turns_to_the_goal_and_slows_while_it_faces_away():
     assert right == pytest.approx([-0.6])
 
 
-def test_baseline_holds_the_default_behaviour_parameters(low):
-    config = low[1]
-    loco = Locomotion(BulletWorld(1, config.robot, config.physics), config)
-    try:
-        driver = BaselineDriver()
-        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
-        driver.begin(loco, np.array([[6.5, 0.0]]), "stair")
-        command = driver.command(0)[0]
-        expected = default_command()
-        for name, value in (("vx", 0.6), ("swing_height", 0.2), ("body_height", 0.04)):
-            expected[INDEX[name]] = value
-        assert command == pytest.approx(expected)
-    finally:
-        loco.world.close()
+def test_baseline_holds_the_default_behaviour_parameters(loco):
+    driver = BaselineDriver()
+    driver.begin(loco, np.array([[6.5, 0.0]]), "stair")
+    command = driver.command(0)[0]
+    expected = default_command()
+    for name, value in (("vx", 0.6), ("swing_height", 0.2), ("body_height", 0.04)):
+        expected[INDEX[name]] = value
+    assert command == pytest.approx(expected)
 
 
 def test_baseline_keeps_to_the_ranges_that_it_is_given(low):
@@ -231,21 +231,16 @@ def test_hierarchy_decides_in_the_evaluation_as_in_its_environment(low, tmp_path
         task.close()
 
 
-def test_commands_are_held_between_decisions(low, tmp_path):
+def test_commands_are_held_between_decisions(low, loco, tmp_path):
     high, config = load_high(save_high(tmp_path / "high", low), *low)
-    loco = Locomotion(BulletWorld(1, low[1].robot, low[1].physics), low[1])
-    try:
-        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
-        driver = HierarchyDriver(high, config)
-        driver.begin(loco, np.array([[6.5, 0.0]]), "rough")
-        commands = []
-        for step in range(2 * config.decimation):
-            commands.append(driver.command(step).copy())
-            loco.world.state.q += 0.1  # something to react to
-        changed = [not np.array_equal(a, b) for a, b in pairwise(commands)]
-        assert np.flatnonzero(changed).tolist() == [4]
-    finally:
-        loco.world.close()
+    driver = HierarchyDriver(high, config)
+    driver.begin(loco, np.array([[6.5, 0.0]]), "rough")
+    commands = []
+    for step in range(2 * config.decimation):
+        commands.append(driver.command(step).copy())
+        loco.world.state.q += 0.1  # something to react to
+    changed = [not np.array_equal(a, b) for a, b in pairwise(commands)]
+    assert np.flatnonzero(changed).tolist() == [4]
 
 
 class Listener:
@@ -259,48 +254,38 @@ class Listener:
         return np.zeros((len(observation), NUM_ACTIONS)), None
 
 
-def test_no_time_is_left_after_the_longest_episode_of_training(low):
+def test_no_time_is_left_after_the_longest_episode_of_training(low, loco):
     config = dataclasses.replace(paired(CONFIG, low[1]), episode_seconds=0.4)
-    loco = Locomotion(BulletWorld(1, low[1].robot, low[1].physics), low[1])
-    try:
-        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
-        high = Listener()
-        driver = HierarchyDriver(high, config)
-        driver.begin(loco, np.array([[6.5, 0.0]]), "rough")
-        for step in range(0, 30, config.decimation):
-            driver.command(step)
-        left = np.concatenate(high.seen)[:, columns(high_layout(config))["time_left"]]
-        np.testing.assert_allclose(left.ravel(), [1.0, 0.75, 0.5, 0.25, 0.0, 0.0], atol=1e-6)
-    finally:
-        loco.world.close()
+    high = Listener()
+    driver = HierarchyDriver(high, config)
+    driver.begin(loco, np.array([[6.5, 0.0]]), "rough")
+    for step in range(0, 30, config.decimation):
+        driver.command(step)
+    left = np.concatenate(high.seen)[:, columns(high_layout(config))["time_left"]]
+    np.testing.assert_allclose(left.ravel(), [1.0, 0.75, 0.5, 0.25, 0.0, 0.0], atol=1e-6)
 
 
-def test_mixed_terrain_is_unknown_to_the_high_level(low, tmp_path):
+def test_mixed_terrain_is_unknown_to_the_high_level(low, loco, tmp_path):
     high, config = load_high(save_high(tmp_path / "high", low), *low)
-    loco = Locomotion(BulletWorld(1, low[1].robot, low[1].physics), low[1])
-    try:
-        loco.place(np.arange(1), np.zeros((1, 2)), np.zeros(1), np.zeros(1))
-        goal = np.array([[6.5, 0.0]])
+    goal = np.array([[6.5, 0.0]])
 
-        def first_command(family: str) -> Array:
-            driver = HierarchyDriver(high, config)
-            driver.begin(loco, goal, family)
-            return driver.command(0)
+    def first_command(family: str) -> Array:
+        driver = HierarchyDriver(high, config)
+        driver.begin(loco, goal, family)
+        return driver.command(0)
 
-        def expected(index: int) -> Array:
-            zero, families = np.zeros((1, NUM_ACTIONS)), np.array([index])
-            probes = height_probes(loco, PROBES[HighLevelConfig().probes])
-            nothing = np.zeros(1)
-            seen = HighSources(loco, goal, nothing, zero, families, probes, nothing, nothing)
-            action, _ = high.predict(observe(high_layout(config), seen))
-            return CommandDecoder(config.commands).decode(action)
+    def expected(index: int) -> Array:
+        zero, families = np.zeros((1, NUM_ACTIONS)), np.array([index])
+        probes = height_probes(loco, PROBES[HighLevelConfig().probes])
+        nothing = np.zeros(1)
+        seen = HighSources(loco, goal, nothing, zero, families, probes, nothing, nothing)
+        action, _ = high.predict(observe(high_layout(config), seen))
+        return CommandDecoder(config.commands).decode(action)
 
-        for family in ("rough", "tilt"):
-            assert np.array_equal(first_command(family), expected(SEMANTIC.index(family)))
-        assert np.array_equal(first_command("mixed"), expected(len(SEMANTIC) - 1))
-        assert not np.array_equal(first_command("mixed"), first_command("rough"))
-    finally:
-        loco.world.close()
+    for family in ("rough", "tilt"):
+        assert np.array_equal(first_command(family), expected(SEMANTIC.index(family)))
+    assert np.array_equal(first_command("mixed"), expected(len(SEMANTIC) - 1))
+    assert not np.array_equal(first_command("mixed"), first_command("rough"))
 
 
 # ------------------------------------------------------------------ pairs that do not fit

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import errno
 import hashlib
@@ -49,6 +48,7 @@ from tdgc.config import (
     to_dict,
 )
 from tdgc.errors import InputError, WorkerError
+from tdgc.files import read_csv
 from tdgc.parallel import cluster
 from tdgc.show import gui
 from tdgc.sim.bullet_world import BulletWorld
@@ -89,8 +89,7 @@ SMALL = ["--levels", "10", "--families", "gap", "--episodes", "2", "--seed", "3"
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
-    with open(folder / "episodes.csv", newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    return read_csv(folder / "episodes.csv")
 
 
 def test_plan_has_every_cell_once_and_fewer_episodes_off_nominal():
@@ -404,6 +403,33 @@ GUI_CONDITION = "--gui shows the nominal condition: no --conditions"
             ["--gui", "watch", "--policies", "gp,tdgc", "--set", "decoder.vx.high=0.6"],
             "--gui watch shows the first policy, gp, but --tune and --set change tdgc",
         ),
+        (["--video", "3", "--episodes", "2"], "--video must lie in [0, --episodes], not 3"),
+        (["--video", "-1"], "--video must lie in [0, --episodes], not -1"),
+        (["--video", "--tracking"], "--tracking has no episodes to film: no --video"),
+        (["--gui", "--video"], "--gui only shows the robot: no --tracking, --trace or --video"),
+        (
+            ["--policies", "gp", "--set", "decision_rate=5"],
+            "--tune and --set change tdgc, which is not among the policies",
+        ),
+        (
+            ["--set", "vx=1"],
+            "unknown configuration key 'vx'; allowed: decoder, decision_rate, safety",
+        ),
+        (["--set", "vx"], "cannot read --set 'vx'; write key=value, e.g. kp=25"),
+        (["--tune", "none.json"], "none.json: No such file or directory"),
+        (
+            ["--set", "decoder.vx.high=1.5"],
+            "decoder.vx.high=1.5: the low policy was trained on [-1.0, 1.2]",
+        ),
+        (
+            ["--tracking", "--set", "decision_rate=5"],
+            "--tracking is of the low policy alone: no --trace, --tune or --set",
+        ),
+        (["--trace", "0"], "--trace must be all, failed or a number from 1, not '0'"),
+        (
+            ["--tracking", "--trace", "all"],
+            "--tracking is of the low policy alone: no --trace, --tune or --set",
+        ),
     ],
 )
 def test_flags_that_cannot_be_used(flags, message, capsys):
@@ -461,8 +487,7 @@ def test_the_teacher_leads_on_any_terrain(tmp_path):
     flags = ["--policies", "teacher", "--conditions", "no-family", "--workers", "1"]
     flags += ["--families", f"{course},mixed", "--levels", "10", "--episodes", "2"]
     assert evaluate.main([*flags, "--out", str(out)]) == 0
-    with (out / "episodes.csv").open(encoding="utf-8") as file:
-        outcomes = [(row["family"], row["outcome"]) for row in csv.DictReader(file)]
+    outcomes = [(row["family"], row["outcome"]) for row in read_csv(out / "episodes.csv")]
     assert {outcome for family, outcome in outcomes if family == str(course)} == {"reached"}
     assert "mixed" in {family for family, _ in outcomes}
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -394,8 +395,7 @@ def without_sources(table: dict[str, Any]) -> None:
 def test_check_finds_an_interface_that_says_something_else(
     short: Path, tmp_path: Path, graph: str, change: Callable[[dict[str, Any]], None], refused: str
 ) -> None:
-    for file in short.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+    shutil.copytree(short, tmp_path, dirs_exist_ok=True)
     high, path = tmp_path / "policy", tmp_path / f"{graph}_interface.json"
     table = json.loads(path.read_text())
     change(table)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import importlib.util
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from tdgc.benchmark.drivers import BaselineDriver
 from tdgc.benchmark.evaluation import Batch, Cell, run_cell, tile_of
 from tdgc.benchmark.recording import Recorder, Recording, runs_of_equal, spans
 from tdgc.config import CommandRanges, RobotConfig
+from tdgc.files import read_csv
 from tdgc.show import film, plots
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import gait_embedding
@@ -332,27 +332,10 @@ def test_without_an_encoder_all_but_mp4_is_written(
         "evaluate.py: MP4 needs av: install the extra 'video', "
         "pip install -c constraints.txt -e '.[video]'"
     )
-    with open(tmp_path / "episodes.csv", newline="", encoding="utf-8") as file:
-        assert len(list(csv.DictReader(file))) == 2
+    assert len(read_csv(tmp_path / "episodes.csv")) == 2
     names = {path.name for path in (tmp_path / "films").iterdir()}
     stem = "gp_nominal_gap_10_000"
     assert names == {f"film_{stem}.gif", f"sheet_{stem}.png", "strip_gap_10.png"}
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--video", "3", "--episodes", "2"], "--video must lie in [0, --episodes], not 3"),
-        (["--video", "-1"], "--video must lie in [0, --episodes], not -1"),
-        (["--video", "--tracking"], "--tracking has no episodes to film: no --video"),
-        (["--gui", "--video"], "--gui only shows the robot: no --tracking, --trace or --video"),
-    ],
-)
-def test_flags_that_cannot_be_used(
-    flags: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert evaluate.main(flags) == 2
-    assert capsys.readouterr().err == f"evaluate.py: {message}\n"
 
 
 def test_what_cannot_be_drawn_is_a_line_each(

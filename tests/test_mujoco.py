@@ -28,7 +28,7 @@ from tdgc.deploy import log
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogError, LogWriter
 from tdgc.errors import WorkerError
-from tdgc.files import checksum
+from tdgc.files import checksum, read_csv
 from tdgc.sim import mujoco_world
 from tdgc.sim.mujoco_world import MujocoConfig, MujocoWorld
 from tdgc.sim.robot import Array, nominal_height, nominal_pose, yaw_quaternion
@@ -499,8 +499,7 @@ def test_a_log_is_diagnosed(
     assert "commands, joint_targets match the graphs within 0.0e+00" in said.out
     traces = list(tmp_path.glob("*.parquet"))
     assert len(traces) == 1 and trace.read(traces[0]).outcome == "fell"
-    with open(tmp_path / "diagnosis.csv", newline="") as file:
-        assert [row["layer"] for row in csv.DictReader(file)] == ["execution"]
+    assert [row["layer"] for row in read_csv(tmp_path / "diagnosis.csv")] == ["execution"]
     targets = np.load(slipped[1])["joint_targets"] + 0.01
     other = edited(slipped[1], tmp_path / "other.npz", joint_targets=targets)
     assert diagnose.main([str(other), *flags]) == 1
@@ -515,8 +514,7 @@ def test_the_benchmark_writes_what_evaluate_writes(folder: Path, tmp_path: Path)
     flags = ["--export", str(folder), "--levels", "9", "--families", "rough,gap", "--log"]
     small = [*flags, "--episodes", "2", "--workers", "1", "--set", "armature=0.005"]
     assert runner.main([*small, "--set", "friction=0.7", "--out", str(tmp_path)]) == 0
-    with open(tmp_path / "episodes.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(tmp_path / "episodes.csv")
     where = [(row["policy"], row["family"], row["level"], row["episode"]) for row in rows]
     assert where == [(runner.POLICY, f, "9", k) for f in ("rough", "gap") for k in "01"]
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -680,9 +678,7 @@ def test_bad_input_is_one_line(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: str, message: str
 ) -> None:
     for name in ("old", "robot", "brief"):
-        (tmp_path / name).mkdir()
-        for path in folder.iterdir():
-            (tmp_path / name / path.name).write_bytes(path.read_bytes())
+        shutil.copytree(folder, tmp_path / name)
     table = json.loads((folder / "low_interface.json").read_text())
     (tmp_path / "old" / "low_interface.json").write_text(json.dumps(table | {"version": 1}))
     table = json.loads((folder / "high_interface.json").read_text())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import sys
 from pathlib import Path
@@ -21,12 +20,12 @@ from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, load
 from tdgc.benchmark.evaluation import Batch, Cell, Episode, run_cell
 from tdgc.benchmark.trace import COLUMNS, Selection, Trace, TraceError, Tracer
 from tdgc.config import HighLevelConfig, HighRewardConfig
+from tdgc.files import read_csv
 from tdgc.sim.commands import CONTINUOUS, INDEX, NAMES, CommandDecoder
 from tdgc.sim.gaits import FEET, GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.tasks.low_rewards import commanded_gravity
-from tdgc.tasks.pairing import PRETRAINED, load_low
 from tdgc.tasks.probes import PROBES, height_probes
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -77,11 +76,6 @@ def watch(driver: Driver, cell: Cell, low: Any) -> tuple[Notes, list[Trace], lis
         patch.setattr(evaluation, "HORIZON", 1.04)  # 52 steps: the last decision is cut short
         episodes = run_cell(cell, low, driver, 5, [notes])
     return notes, notes.traces(), episodes
-
-
-@pytest.fixture(scope="module")
-def low():
-    return load_low(PRETRAINED / "low")
 
 
 @pytest.fixture(scope="module")
@@ -410,23 +404,20 @@ def test_selection(watched):
 def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
     flags = [*SMALL, "--policies", "gp", "--workers", "1", "--out", str(tmp_path)]
     assert evaluate.main([*flags, "--trace", "failed"]) == 0
-    with open(tmp_path / "episodes.csv", newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(tmp_path / "episodes.csv")
     failed = [r for r in rows if r["outcome"] != "reached"]
     assert failed
     written = [trace.read(p) for p in sorted((tmp_path / "traces").iterdir())]
     assert [(str(t.episode), t.outcome) for t in written] == [
         (r["episode"], r["outcome"]) for r in failed
     ]
-    with open(tmp_path / "diagnosis.csv", newline="", encoding="utf-8") as file:
-        diagnosed = list(csv.DictReader(file))
+    diagnosed = read_csv(tmp_path / "diagnosis.csv")
     assert [(d["episode"], d["outcome"]) for d in diagnosed] == [
         (r["episode"], r["outcome"]) for r in failed
     ]
     said = capsys.readouterr().out
     assert "largest possible gain: gap, decisions, 100.0 points" in said
-    with open(tmp_path / "behaviour.csv", newline="", encoding="utf-8") as file:
-        walked = list(csv.DictReader(file))  # of all episodes, failed or not
+    walked = read_csv(tmp_path / "behaviour.csv")  # of all episodes, failed or not
     assert [(w["episode"], w["trot"]) for w in walked] == [(r["episode"], "1.0000") for r in rows]
     assert "how gp walks, nominal" in said
     # Fewer traces in the same folder: the old ones are removed.
@@ -447,18 +438,3 @@ def test_without_pyarrow_the_script_says_what_to_install(tmp_path, monkeypatch, 
     message += "pip install -c constraints.txt -e '.[trace]'"
     assert capsys.readouterr().err == f"evaluate.py: {message}\n"
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--trace", "0"], "--trace must be all, failed or a number from 1, not '0'"),
-        (
-            ["--tracking", "--trace", "all"],
-            "--tracking is of the low policy alone: no --trace, --tune or --set",
-        ),
-    ],
-)
-def test_flags_that_cannot_be_used(flags, message, capsys):
-    assert evaluate.main(flags) == 2
-    assert capsys.readouterr().err == f"evaluate.py: {message}\n"

@@ -33,15 +33,9 @@ from tdgc.sim.commands import CONTINUOUS, INDEX, gait_index
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
-from tdgc.tasks.pairing import PRETRAINED, load_low
 
 LOW = LowLevelConfig()
 HIGH = HighLevelConfig(commands=LOW.commands)
-
-
-@pytest.fixture(scope="module")
-def low():
-    return load_low(PRETRAINED / "low")
 
 
 @pytest.fixture(scope="module")
@@ -357,31 +351,3 @@ def test_the_script_shows_both_beside_each_other(tmp_path, capsys):
     # The next run in this folder has no tuning, so the file is removed.
     assert evaluate.main([*flags[:-4], "--policies", "gp", "--out", str(tmp_path)]) == 0
     assert not (tmp_path / "tuning.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (
-            ["--policies", "gp", "--set", "decision_rate=5"],
-            "--tune and --set change tdgc, which is not among the policies",
-        ),
-        (
-            ["--set", "vx=1"],
-            "unknown configuration key 'vx'; allowed: decoder, decision_rate, safety",
-        ),
-        (["--set", "vx"], "cannot read --set 'vx'; write key=value, e.g. kp=25"),
-        (["--tune", "none.json"], "none.json: No such file or directory"),
-        (
-            ["--set", "decoder.vx.high=1.5"],
-            "decoder.vx.high=1.5: the low policy was trained on [-1.0, 1.2]",
-        ),
-        (
-            ["--tracking", "--set", "decision_rate=5"],
-            "--tracking is of the low policy alone: no --trace, --tune or --set",
-        ),
-    ],
-)
-def test_flags_that_cannot_be_used(flags, message, capsys):
-    assert evaluate.main(flags) == 2
-    assert capsys.readouterr().err == f"evaluate.py: {message}\n"
