@@ -101,11 +101,8 @@ def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "perf_counter", lambda: now)
     monkeypatch.setattr(bench, "HighTrainConfig", lambda: HighTrainConfig(n_envs=4))
     monkeypatch.setattr(bench, "UPDATES", 3)
-    assert bench.compare_updates() == {
-        "stock": 6.0,
-        "fast": 2.0,
-        "ratio": 3.0,
-    }  # ratios of 2, 3 and 6
+    # The ratios are 2, 3 and 6.
+    assert bench.compare_updates() == {"stock": 6.0, "fast": 2.0, "ratio": 3.0}
 
 
 @pytest.mark.parametrize(

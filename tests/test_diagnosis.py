@@ -67,6 +67,13 @@ def test_a_blindfold_is_the_decisions_fault(low, pair):
     assert len(layers) >= 3 and layers.count("decisions") >= 0.8 * len(layers)
 
 
+def test_a_blindfolds_trace_has_no_probes(low, pair):
+    (seen,) = planted.traced(HierarchyDriver(*pair), low[0], "rough", 0, 1, planted.SEED)
+    (blind,) = planted.traced(Blindfold(*pair), low[0], "rough", 0, 1, planted.SEED)
+    assert seen.probes and np.isfinite(seen["probe_00"][:-1]).all()
+    assert not blind.probes and np.isnan(blind["probe_00"]).all()
+
+
 def test_limits_are_measured_where_nothing_is_wrong():
     """One of 60 stretches, three per episode, has an error of 0.5 m/s; all others have 0.1."""
     traces = [walk(outcome="reached", seconds=7.0, error_vx=0.1) for _ in range(20)]

@@ -65,13 +65,14 @@ from tdgc.tasks.rules import OUTCOMES
 
 
 @pytest.fixture(scope="module")
-def low():
-    return load_low(PRETRAINED / "low")[0]
+def low(low):
+    """Here, the shipped low policy alone."""
+    return low[0]
 
 
 @pytest.fixture(scope="module")
-def high(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_high(tmp_path_factory.mktemp("policy") / "high", load_low(PRETRAINED / "low"))
+def high(low, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_high(tmp_path_factory.mktemp("policy") / "high", (low, mdp_of(low)))
 
 
 @pytest.fixture(scope="module")

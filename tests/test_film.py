@@ -18,13 +18,13 @@ from tdgc.benchmark import evaluation
 from tdgc.benchmark.drivers import BaselineDriver
 from tdgc.benchmark.evaluation import Batch, Cell, run_cell, tile_of
 from tdgc.benchmark.recording import Recorder, Recording, runs_of_equal, spans
-from tdgc.config import CommandRanges, RobotConfig
+from tdgc.config import CommandRanges, LowLevelConfig, RobotConfig
 from tdgc.files import read_csv
+from tdgc.policies import Policy
 from tdgc.show import film, plots
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.gaits import gait_embedding
 from tdgc.sim.robot import Array, nominal_pose
-from tdgc.tasks.pairing import PRETRAINED, load_low
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
@@ -79,6 +79,7 @@ class Notes:
                     "position": state.position[1] - [*self._origin, 0.0],
                     "q": state.q[1].copy(),
                     "command": self._loco.carried_out[1].copy(),
+                    "height": self._loco.world.trunk_height()[1],
                     "contact": state.foot_force[1] > 1.0,
                     "desired": self._loco.clock.contact[1] > 0.5,
                     "quaternion": state.quaternion[1].copy(),
@@ -87,13 +88,15 @@ class Notes:
             )
 
 
-def test_a_recording_is_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_is_the_episode(
+    low: tuple[Policy, LowLevelConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It equals what another watcher sees, and recording does not change the episode."""
     monkeypatch.setattr(evaluation, "HORIZON", 0.4)
-    low, driver = load_low(PRETRAINED / "low")[0], BaselineDriver()
+    driver = BaselineDriver()
     cell, notes, recorder = Cell("gp", "nominal", "rough", 9, 0, 3), Notes(), Recorder(driver, 2)
-    watched = run_cell(cell, low, driver, 5, [notes, recorder])
-    alone = run_cell(cell, low, BaselineDriver(), 5)
+    watched = run_cell(cell, low[0], driver, 5, [notes, recorder])
+    alone = run_cell(cell, low[0], BaselineDriver(), 5)
     assert [e.row() for e in watched] == [e.row() for e in alone]
     first, second = recorder.recordings()
     assert [first.name, second.name] == ["gp_nominal_rough_09_000", "gp_nominal_rough_09_001"]
@@ -109,12 +112,14 @@ def test_a_recording_is_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.linalg.norm(steps, axis=1) == pytest.approx(0.02 * speed, rel=0.35, abs=2e-3)
 
 
-def test_only_the_first_episodes_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_first_episodes_are_recorded(
+    low: tuple[Policy, LowLevelConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(evaluation, "HORIZON", 0.04)
-    low, driver = load_low(PRETRAINED / "low")[0], BaselineDriver()
+    driver = BaselineDriver()
     for first, count, numbers in ((0, 1, [0]), (1, 3, [1, 2]), (1, 1, [])):
         recorder = Recorder(driver, count)
-        run_cell(Cell("gp", "nominal", "rough", 0, first, 2), low, driver, 0, [recorder])
+        run_cell(Cell("gp", "nominal", "rough", 0, first, 2), low[0], driver, 0, [recorder])
         assert [r.episode for r in recorder.recordings()] == numbers
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import time
+from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,14 +14,16 @@ import evaluate
 from tdgc.benchmark import evaluation
 from tdgc.benchmark.drivers import BaselineDriver
 from tdgc.benchmark.evaluation import Cell, tile_of
-from tdgc.config import ConfigError
+from tdgc.config import ConfigError, LowLevelConfig
+from tdgc.policies import Policy
 from tdgc.show import gui
 from tdgc.show.gui import describe, slider_command
+from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, default_command
 from tdgc.sim.display import WindowError, check_display
 from tdgc.sim.gaits import GAIT_TABLE, GAITS
 from tdgc.sim.robot import Array
-from tdgc.tasks.pairing import PRETRAINED, load_low
+from tdgc.tasks.rules import FELL, GOING
 
 
 def test_sliders_are_the_commands() -> None:
@@ -38,14 +43,14 @@ def test_the_text_says_gait_and_velocities() -> None:
     assert text == "bound, vx -0.25 m/s, vy 0.00 m/s, yaw_rate 0.00 rad/s"
 
 
-def test_who_drives_needs_no_high_policy_that_fits() -> None:
+def test_who_drives_needs_no_high_policy_that_fits(low: tuple[Policy, LowLevelConfig]) -> None:
     """The low policy may be of a robot that the shipped high policy does not know."""
     driving = evaluate.Evaluation.of(evaluate.parse(["--gui", "drive", "--workers", "1"]))
-    low, config = load_low(PRETRAINED / "low")
+    policy, config = low
     other = dataclasses.replace(config, robot=dataclasses.replace(config.robot, kp=30.0))
-    assert driving.drivers(low, other) == {}
+    assert driving.drivers(policy, other) == {}
     with pytest.raises(ConfigError, match=r"trained for a low policy with robot.kp 20.0, not 30.0"):
-        dataclasses.replace(driving, mode="watch").drivers(low, other)
+        dataclasses.replace(driving, mode="watch").drivers(policy, other)
 
 
 @pytest.mark.parametrize("display", ["", ":4711"])
@@ -65,10 +70,13 @@ def test_no_display(
 
 
 class Pane:
-    """Stands in for Bullet's window; it is closed after the last of the sliders' ``values``."""
+    """Stands in for Bullet's window.
 
-    def __init__(self, values: list[Array]) -> None:
-        self._values = iter(values)
+    It is closed after the last of the sliders' ``values``, and when it has shown ``texts`` texts.
+    """
+
+    def __init__(self, values: Sequence[Array] = (), texts: int = 100) -> None:
+        self._values, self._most = iter(values), texts
         self.sliders: list[str] = []
         self.seen: list[Array] = []
         self.texts: list[str] = []
@@ -87,34 +95,48 @@ class Pane:
 
     def follow(self, text: str) -> None:
         self.texts.append(text)
-        if text == "timeout":
+        if len(self.texts) == self._most:
             raise WindowError("the window was closed")
 
     def close(self) -> None:
         self.closed = True
 
+    def open(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Be the window that ``gui`` opens, which then does not run in real time."""
+        clock = SimpleNamespace(sleep=lambda _: None, perf_counter=time.perf_counter)
+        monkeypatch.setattr(gui, "set_stage", lambda *_, **__: self)
+        monkeypatch.setattr(gui, "time", clock)
 
-def test_the_button_puts_the_robot_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A robot walks ahead for a second; closing the window is the normal end."""
+
+@pytest.mark.parametrize("reason", ["the button", "a fall"])
+def test_the_robot_returns_to_the_start(
+    reason: str, low: tuple[Policy, LowLevelConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After it has walked ahead for a second. Closing the window is the normal end."""
     ahead = np.append(default_command()[:12], [0.0, 0.0])  # trot; the button is not pressed
     ahead[INDEX["vx"]] = 0.6
     pressed = np.append(ahead[:-1], 1.0)
-    pane = Pane([ahead] * 50 + [pressed])
-    monkeypatch.setattr(gui, "set_stage", lambda *_, **__: pane)
-    monkeypatch.setattr(gui.time, "sleep", lambda _: None)
-    gui.drive(load_low(PRETRAINED / "low")[0], Cell("gp", "nominal", "rough", 0, 0, 1), 0)
+    pane, worlds = Pane([*[ahead] * 50, pressed if reason == "the button" else ahead]), []
+    pane.open(monkeypatch)
+    close = BulletWorld.close
+    monkeypatch.setattr(BulletWorld, "close", lambda world: worlds.append(world) or close(world))
+    if reason == "a fall":
+        down = lambda world: np.array([FELL if len(pane.seen) == 50 else GOING])  # noqa: E731
+        monkeypatch.setattr(gui, "outcome", down)
+    gui.drive(low[0], Cell("gp", "nominal", "rough", 0, 0, 1), 0)
     x, y, _ = tile_of(0, "rough", 0, 0).start
     away = [np.hypot(place[0] - x, place[1] - y) for place in pane.seen]
     assert len(away) == 51 and away[49] > 0.2 and away[50] < 0.01
-    assert pane.sliders[0] == "vx (m/s)" and len(pane.sliders) == 14 and pane.closed
+    assert pane.sliders[0] == "vx (m/s)" and len(pane.sliders) == 14
+    assert pane.closed and len(worlds) == 1
 
 
-def test_watching_shows_the_episode_and_then_its_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watching_shows_the_episode_and_then_its_outcome(
+    low: tuple[Policy, LowLevelConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(evaluation, "HORIZON", 0.3)
-    pane = Pane([])
-    monkeypatch.setattr(gui, "set_stage", lambda *_, **__: pane)
-    monkeypatch.setattr(gui.time, "sleep", lambda _: None)
-    low = load_low(PRETRAINED / "low")[0]
-    gui.watch(low, BaselineDriver(), Cell("gp", "nominal", "rough", 0, 0, 1), 0)
+    pane = Pane(texts=5)  # three in the episode
+    pane.open(monkeypatch)
+    gui.watch(low[0], BaselineDriver(), Cell("gp", "nominal", "rough", 0, 0, 1), 0)
     assert len(pane.seen) == 15 and pane.closed
-    assert pane.texts[0].startswith("trot, vx 0.") and pane.texts[-1] == "timeout"
+    assert pane.texts[0].startswith("trot, vx 0.") and pane.texts[3:] == ["timeout"] * 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import closing
 
 import gymnasium as gym
 import numpy as np
@@ -753,28 +754,37 @@ def test_disturbances_widen_with_the_level():
 
 
 def test_success_is_of_the_episodes_that_the_policy_drove():
-    config = dataclasses.replace(CONFIG, families=("tilt",))
-    task = NavigationTask(config, LOW_POLICY, 4, seed=3, training=False)
-    task.reset(np.arange(4))
+    """Robots 0, 2 and 4 are on Tilt, the others on Stair."""
+    config = dataclasses.replace(CONFIG, families=("tilt", "stair"))
+    task = NavigationTask(config, LOW_POLICY, 6, seed=3, training=False)
+    task.reset(np.arange(6))
+    task.curriculum.levels[:] = [0, 5, 2, 6, 4, 7]
     task.elapsed[:] = task.horizon - 1
-    task.goal[:2] = task.locomotion.world.state.position[:2, :2]
-    task._led[1] = True  # reaches its goal, but the teacher drove it
-    task.step(np.zeros((4, 13)))
+    task.goal[:4] = task.locomotion.world.state.position[:4, :2]
+    task._led[2] = True  # reaches its goal, but the teacher drove it
+    task.step(np.zeros((6, 13)))
     values = summarise_high(task.take_stats())
     task.close()
-    assert values["success/tilt"] == pytest.approx(1 / 3)
-    assert values["gait/tilt_pace"] == 1.0  # the gait of an action 0
+    for name, value in (
+        ("success/tilt", 1 / 2), ("success/stair", 2 / 3), ("level/tilt", 2.0),
+        ("level/stair", 6.0), ("gait/tilt_pace", 1.0), ("gait/stair_pace", 1.0),
+    ):  # fmt: skip
+        assert values[name] == pytest.approx(value), name  # pace is the gait of an action 0
 
 
 def test_nothing_is_logged_of_a_family_without_robots():
-    values = summarise_high({"family/stair/count": 0.0, "family/stair/level": 0.0})
-    assert set(values) == {"reward/total"}
+    config = dataclasses.replace(CONFIG, families=("tilt", "stair"))
+    task = NavigationTask(config, LOW_POLICY, 1, seed=3, training=False)
+    task.reset(np.arange(1))
+    task.step(np.zeros((1, 13)))
+    values = summarise_high(task.take_stats())
+    task.close()
+    assert "level/tilt" in values and not [name for name in values if "stair" in name]
 
 
 def test_info_says_whether_the_goal_is_reached():
-    env = gym.make("tdgc/Navigation-v0").unwrapped
-    env.reset(seed=0)
-    assert env.step(np.zeros(13, np.float32))[4] == {"is_success": False}
-    env.task.goal[:] = env.task.world.state.position[:, :2]
-    assert env.step(np.zeros(13, np.float32))[4] == {"is_success": True}
-    env.close()
+    with closing(gym.make("tdgc/Navigation-v0").unwrapped) as env:
+        env.reset(seed=0)
+        assert env.step(np.zeros(13, np.float32))[4] == {"is_success": False}
+        env.task.goal[:] = env.task.world.state.position[:, :2]
+        assert env.step(np.zeros(13, np.float32))[4] == {"is_success": True}

@@ -22,7 +22,7 @@ from tdgc.config import (
 )
 from tdgc.parallel.group import TaskGroup
 from tdgc.sim.commands import INDEX, command_bounds, default_command, gait_index
-from tdgc.sim.gaits import gait_embedding
+from tdgc.sim.gaits import GAITS, gait_embedding
 from tdgc.sim.observation import columns, width
 from tdgc.sim.robot import Array, nominal_pose, yaw_quaternion
 from tdgc.sim.terrain import make_tile, tile_rng
@@ -247,10 +247,13 @@ def test_statistics_of_a_run() -> None:
         task.step(still(task))
     sums = task.take_stats()
     assert sums["steps"] == 12 and sums["falls"] == 0
-    steps = [sums[f"gait/{gait}/steps"] for gait in ("trot", "pronk", "pace", "bound")]
-    assert sum(steps) == 12
+    assert sum(sums[f"gait/{gait}/steps"] for gait in GAITS) == 12
     task.step(still(task))
-    assert task.take_stats()["steps"] == 4  # since the last call
+    stats, now = task.take_stats(), by_gait(task.locomotion, {})
+    assert stats["steps"] == 4  # since the last call
+    for key in ("steps", "lin", "yaw", "match"):
+        found = [stats[f"gait/{gait}/{key}"] for gait in GAITS]
+        assert found == now[key].tolist() and sum(found) > 0.0
     values = summarise_low({**sums, "falls": 3.0})
     assert values["reward/total"] == pytest.approx(sums["reward"] / 12)
     assert values["falls_per_minute"] == pytest.approx(3 / (12 * 0.02 / 60))

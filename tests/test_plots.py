@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib.image
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -59,7 +60,12 @@ def picture(path: Path) -> Array:
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """The figures drawn from now on, which are collected instead of written."""
     figures: list[Figure] = []
-    monkeypatch.setattr(plots, "_save", lambda figure, out: figures.append(figure))
+
+    def keep(figure: Figure, out: Path) -> None:
+        figures.append(figure)
+        plt.close(figure)  # pyplot forgets it, it can still be looked at
+
+    monkeypatch.setattr(plots, "_save", keep)
     return figures
 
 
@@ -82,10 +88,22 @@ def test_success_figure_with_rates_of_none_and_all(tmp_path: Path) -> None:
 
 def test_success_figure_shows_the_rates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path)
+    table = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    wanted = {"tdgc": [[90.0, 80.0], [70.0, 60.0]], "gp": [[50.0, 40.0], [30.0, 20.0]]}
+    for policy, families in wanted.items():
+        for family, shares in zip(FAMILIES, families, strict=True):
+            for level, share in zip("67", shares, strict=True):
+                table[policy]["nominal"][family][level]["rate"] = share / 100.0
+    (tmp_path / "summary.json").write_text(json.dumps(table), encoding="utf-8")
     figures = drawn(monkeypatch)
     plots.success_by_level(tmp_path / "summary.json", tmp_path / "one.png")
-    rates = {c.get_label(): c.lines[0].get_ydata().tolist() for c in figures[0].axes[0].containers}
-    assert rates == {"tdgc": [100.0, 100.0], "gp": [0.0, 0.0]}
+    for k, axis in enumerate(figures[0].axes):
+        found = {c.get_label(): c.lines[0].get_xydata() for c in axis.containers}
+        assert axis.get_title() == FAMILIES[k]
+        assert {policy: way[:, 1].tolist() for policy, way in found.items()} == {
+            policy: pytest.approx(families[k]) for policy, families in wanted.items()
+        }
+        assert all(np.round(way[:, 0]).tolist() == [6.0, 7.0] for way in found.values())
 
 
 def test_gait_figure_is_half_and_half(tmp_path: Path) -> None:

@@ -26,10 +26,10 @@ def test_each_robot_has_a_tile_of_its_own() -> None:
 
 
 def test_trenches_may_be_shallower_on_low_levels() -> None:
-    for shallowest, depth in ((None, 0.6), (0.04, 0.18)):  # 0.04 + 0.5^2 (0.6 - 0.04)
-        tiles = TrainingTiles(("gap",), 9, shallowest)
-        tiles.draw(np.array([0]), np.array([5]))
-        assert heights(tiles, 0).min() == pytest.approx(-depth)
+    for shallowest, depths in ((None, (0.6, 0.6)), (0.04, (0.18, 0.6))):  # 0.04 + 0.25 * 0.56
+        tiles = TrainingTiles(("gap", "gap"), 9, shallowest)
+        tiles.draw(np.array([0, 1]), np.array([5, 10]))
+        assert [-heights(tiles, robot).min() for robot in (0, 1)] == pytest.approx(depths)
 
 
 def test_a_tile_serves_five_episodes_of_a_level() -> None:
@@ -77,6 +77,7 @@ def test_mixed_is_kept_for_evaluation() -> None:
 
 
 @pytest.mark.parametrize("levels", [0, 12])
-def test_the_highest_levels_are_kept_for_evaluation(levels: int) -> None:
+def test_the_number_of_levels_is_limited(levels: int) -> None:
+    check_tiles(("stair",), 1)
     with pytest.raises(ValueError, match=f"must be from 1 to 11, not {levels}"):
         check_tiles(("stair",), levels)

@@ -16,6 +16,7 @@ from test_evaluation import SMALL
 
 import evaluate
 from tdgc.benchmark import evaluation, trace
+from tdgc.benchmark.behaviour import MEANS
 from tdgc.benchmark.drivers import BaselineDriver, Driver, HierarchyDriver, load_high
 from tdgc.benchmark.evaluation import Batch, Cell, Episode, run_cell
 from tdgc.benchmark.trace import COLUMNS, Selection, Trace, TraceError, Tracer
@@ -419,6 +420,7 @@ def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
     assert "largest possible gain: gap, decisions, 100.0 points" in said
     walked = read_csv(tmp_path / "behaviour.csv")  # of all episodes, failed or not
     assert [(w["episode"], w["trot"]) for w in walked] == [(r["episode"], "1.0000") for r in rows]
+    assert list(walked[0])[-len(MEANS) :] == list(MEANS)
     assert "how gp walks, nominal" in said
     # Fewer traces in the same folder: the old ones are removed.
     assert evaluate.main([*flags, "--trace", "1"]) == 0

@@ -49,6 +49,7 @@ from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import Machine, _keep_start, add_arguments, configure
 from tdgc.learn.imitation import TaughtPolicy
 from tdgc.learn.ppo import LinearRate, NoiseScaledRate
+from tdgc.learn.recurrent import exchange_memories
 from tdgc.learn.run import Interruption, Run, append_line, drop_rows_after, tensorboard_logger
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import worker_seed
@@ -57,6 +58,7 @@ from tdgc.policies import AsymmetricActorCriticPolicy
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import actor_layout
 from tdgc.sim.observation import width
+from tdgc.tasks.high_observation import untold_column
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 from tdgc.tasks.pairing import PRETRAINED, load_low
 
@@ -512,7 +514,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
 
     Each makes five updates of the recurrent learner, two of imitation and three of reinforcement
     learning, and keeps the LSTM states of the current episodes. The second run writes a checkpoint
-    after each update, is stopped after the first and killed during the rollout of the fourth.
+    after each update, is stopped after the first and killed as soon as that of the third is there.
     """
     arguments = [
         "--seed", "3", "--n-envs", "2", "--workers", "1", "--steps", "40",
@@ -564,7 +566,7 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert (broken / "config.json").read_text(encoding="utf-8") == config
     kill_run("train_high.py", ["--resume", "--out", str(broken)], last)
     cut = Checkpoint.read(newest(broken))
-    assert 24 <= cut.steps < 40
+    assert cut.steps < 40
     (state,) = cut.workers()
     assert state["lengths"].max() > 0  # updates come every 4 decisions, within episodes of 7
     assert cut.tensors["lstm.pi.h"].any()
@@ -970,7 +972,10 @@ def test_a_start_from_a_policy_of_other_settings_names_them(
     assert train_high.main([*small, "--out", str(first)]) == 0
     begin = ["--init", str(first / "policy"), "--set", "env.commands.vx=[-1,0.8]"]
     assert train_high.main([*small, *begin, "--seed", "7", "--out", str(slower)]) == 0
-    assert weights(slower) == weights(first)  # from scratch, another seed begins elsewhere
+    assert weights(slower) == weights(first)
+    fresh = tmp_path / "fresh"
+    assert train_high.main([*small, "--seed", "7", "--out", str(fresh)]) == 0
+    assert weights(fresh) != weights(first)
     told = [line for line in capsys.readouterr().out.splitlines() if "was trained with" in line]
     vx = "env.commands.vx=[-1.0, 1.2], not [-1.0, 0.8]"
     assert told == [f"{first / 'policy'} was trained with {vx}"]
@@ -980,7 +985,7 @@ def test_a_start_from_a_policy_of_other_settings_names_them(
 def test_a_start_from_a_policy_for_another_robot_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also if it cannot tell what the policy was trained with."""
+    """Also if the policy's file does not say what it was trained with."""
     small = ["--n-envs", "4", "--workers", "1", "--set", "ppo.lstm=8", "--set", "ppo.minibatches=4"]
     small += ["--set", "imitation.steps=0", "--time-limit", "0"]
     assert train_high.main([*small, "--out", str(tmp_path / "first")]) == 0
@@ -994,7 +999,7 @@ def test_a_start_from_a_policy_for_another_robot_says_so(
         lines = capsys.readouterr().out.splitlines()
         said += [line for line in lines if "settings" in line or "was trained with" in line]
     assert said[0] == f"{tmp_path / 'stiff'} was trained with low.robot.kp=25.0, not 20.0"
-    assert said[1].startswith("cannot compare the settings: ")
+    assert len(said) == 2 and said[1].startswith("cannot compare the settings: ")
 
 
 @pytest.mark.parametrize(
@@ -1174,7 +1179,11 @@ def test_the_learner_is_given_the_imitation_loss_and_the_exchange(
     low = policies.load(PRETRAINED / "low")
     machine = Machine("cpu", 1.0, ProcessLink)
     model, _ = train_high.build_reinforcement(config, low, machine)
-    assert made["policy"] is TaughtPolicy and made["exchange"].keywords["share"] == 0.3
+    assert made["policy"] is TaughtPolicy
+    untold = untold_column(config.env)
+    assert untold is not None
+    assert made["exchange"].func is exchange_memories
+    assert made["exchange"].keywords == {"share": 0.3, "untold": untold}
     assert model.policy.imitation_weight == pytest.approx(0.2 / config.ppo.ent_coef)
 
 
