@@ -7,15 +7,19 @@ from collections.abc import Callable
 from typing import ParamSpec
 
 
+def escaped(text: str) -> str:
+    """The text on one line: unprintable characters, such as the ends of lines, are escaped."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 class InputError(ValueError):
     """Input that was read but cannot be used.
 
-    Messages quote keys, values and file names, which may contain anything. Unprintable characters
-    are escaped, so a message is always one line.
+    Messages quote keys, values and file names, which may contain anything, so they are ``escaped``.
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
+        super().__init__(escaped(message))
 
 
 class WorkerError(RuntimeError):

@@ -1,4 +1,4 @@
-"""Atomic file writes, checksums, and writable folders."""
+"""Atomic file writes, tables, checksums, and writable folders."""
 
 import contextlib
 import csv

@@ -144,22 +144,28 @@ def run_episode(
 
 
 def run_cell(
-    cell: Cell, args: argparse.Namespace, config: "MujocoConfig"
+    cell: Cell,
+    export: Path,
+    config: "MujocoConfig",
+    seed: int,
+    filmed: int,
+    logs: Path,
+    logged: int,
 ) -> tuple[list[Episode], list[Recording]]:
     """Run the episodes of a cell one after another.
 
-    Records the first ``args.video`` of them, and writes logs of the first ``args.log``.
+    Records the first ``filmed`` episodes and writes logs of the first ``logged`` into ``logs``.
     """
-    controller, episodes, recordings = load(args.export), [], list[Recording]()
+    controller, episodes, recordings = load(export), [], list[Recording]()
     for number in range(cell.first, cell.first + cell.count):
         one = Cell(cell.policy, cell.condition, cell.family, cell.level, number, 1)
-        pair = Deployed(controller, LogWriter(controller) if number < args.log else None)
-        recorder = Recorder(pair, args.video)
-        episode = run_episode(one, pair, config, args.seed, [recorder])
+        pair = Deployed(controller, LogWriter(controller) if number < logged else None)
+        recorder = Recorder(pair, filmed)
+        episode = run_episode(one, pair, config, seed, [recorder])
         episodes.append(episode)
         recordings += recorder.recordings()
         if pair.log is not None:
-            pair.log.save(args.out / "logs" / f"{episode.name}.npz")
+            pair.log.save(logs / f"{episode.name}.npz")
     return episodes, recordings
 
 
@@ -180,7 +186,15 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
     settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
     write_json(args.out / "settings.json", settings)
     cells = plan([POLICY], ["nominal"], args.families, args.levels, args.episodes)
-    work = functools.partial(run_cell, args=args, config=config)
+    work = functools.partial(
+        run_cell,
+        export=args.export,
+        config=config,
+        seed=args.seed,
+        filmed=args.video,
+        logs=args.out / "logs",
+        logged=args.log,
+    )
     controller = load(args.export)
     tables = {"low": controller.low.table["policy"], "high": controller.high.table["policy"]}
     trained_on = Training(editions_of(tables), robot_changes_of(controller))

@@ -5,6 +5,7 @@ import pytest
 
 from tdgc.config import CommandRanges
 from tdgc.sim.commands import (
+    COMMANDS,
     CONTINUOUS,
     INDEX,
     NAMES,
@@ -43,6 +44,12 @@ def test_names_units_and_sizes() -> None:
     assert [INDEX[name] for name in NAMES] == list(range(15))
     decoder = CommandDecoder()
     assert decoder.names == NAMES and decoder.units == UNITS
+
+
+def test_meanings_name_the_robots_own_stance() -> None:
+    for name in ("stance_width", "stance_length"):
+        own = f"{default_command()[INDEX[name]]:g} is the robot's own stance"
+        assert COMMANDS[name][1].endswith(own)
 
 
 def test_bounds() -> None:

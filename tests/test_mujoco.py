@@ -1,6 +1,5 @@
 """MuJoCo's robot and ground match Bullet's; an exported pair is evaluated and logged there."""
 
-import argparse
 import csv
 import dataclasses
 import errno
@@ -528,8 +527,7 @@ def test_the_benchmark_writes_what_evaluate_writes(folder: Path, tmp_path: Path)
     # An episode depends on its tile and the settings alone, not on what ran before.
     one = Cell(runner.POLICY, "nominal", "gap", 9, 1, 1)
     config = MujocoConfig(armature=0.005, friction=0.7)
-    args = argparse.Namespace(export=folder, seed=0, video=0, log=0, out=tmp_path)
-    episodes, _ = runner.run_cell(one, args, config)
+    episodes, _ = runner.run_cell(one, folder, config, 0, 0, tmp_path, 0)
     assert {key: str(value) for key, value in episodes[0].row().items()} == rows[3]
 
 

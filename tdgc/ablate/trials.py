@@ -22,7 +22,7 @@ import train_high
 from tdgc import policies
 from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
-from tdgc.errors import FAILURES, InputError, StoppedError, what_stopped
+from tdgc.errors import FAILURES, InputError, StoppedError, escaped, what_stopped
 from tdgc.files import read_csv, write_json
 from tdgc.learn.run import signals_restored
 from tdgc.parallel.cores import Workers
@@ -124,7 +124,7 @@ class Runner:
             said = what_stopped(error)
         except Exception as error:  # whatever happened, the other trials continue
             said = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return str(TrialError(said))  # on one line, of printable characters
+        return escaped(said)
 
     def done(self, trial: Trial) -> bool:
         """Whether an earlier call has finished the trial."""

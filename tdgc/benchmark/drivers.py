@@ -35,7 +35,7 @@ class Driver(ABC):
     Attributes:
         config: the MDP of its decisions, with cues "none" if it uses no cues.
         bounds: ranges that its commands stay within.
-        action: (M, 13) raw policy output of the last decision; None if the driver decodes none.
+        action: (M, 13) of the last decision, not decoded; None if the driver decodes none.
         told: family that the driver is told; None if it uses no such cue.
         probes: (M, 32) m, heights used by the last decision; None if the driver uses none.
     """

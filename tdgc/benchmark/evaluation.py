@@ -221,11 +221,11 @@ class Watcher(Protocol):
 
     def step(self, step: int, live: NDArray[np.intp]) -> None:
         """Handle the end of control step number ``step``, in which the robots ``live`` (n,) took
-        part."""
+        part; the batch's ``steps`` and ``outcome`` include it."""
 
 
 class Batch:
-    """The robots of a cell, each on its tile, under the cell's condition.
+    """The robots of a cell, each on its tile, under the cell's condition; they are run once.
 
     Args:
         cell: the episodes to run.
@@ -321,7 +321,8 @@ class EpisodeLog:
         self._position = batch.loco.world.state.position[:, :2].copy()
 
     def add(self, step: int) -> None:
-        """Log the state of the robots after control step number ``step``.
+        """Log the state of the robots after control step number ``step``, and end the episodes that
+        are over, in the batch's ``outcome``.
 
         Raises:
             FloatingPointError: a robot's position is not finite. In Bullet, the other robots would
@@ -389,7 +390,7 @@ def closed_loop(
 ) -> list[Episode]:
     """Run the paper's closed loop (Sec. IV) until every episode of a batch has ended.
 
-    Driver and watchers begin first. Returns one episode per robot, in order.
+    The batch is new; driver and watchers begin first. Returns one episode per robot, in order.
     """
     driver.begin(batch.loco, batch.goal, batch.told, batch.probes)
     for watcher in watchers:

@@ -255,6 +255,9 @@ def effect(episodes: Sequence[Episode], before: str, after: str) -> dict[str, An
     Figures are ``success`` and, pooled over all of a policy's episodes, ``mean_speed`` in m/s along
     the path and ``energy_per_metre`` in J (None if nothing moved). ``gained`` counts the tiles on
     which only ``after`` reached the goal, ``lost`` those on which only ``before`` did.
+
+    Raises:
+        ValueError: only one of the policies was run on some tile.
     """
     result: dict[str, Any] = {}
     for condition, families in compare(episodes, after, before).items():

@@ -209,7 +209,7 @@ def quiet() -> Iterator[None]:
 
 
 class Controller:
-    """Both graphs of a folder, run in the order and with the memory that the interface specifies.
+    """Both graphs of a folder, run as the interface specifies: ``high`` first, if it is due.
 
     Args:
         folder: folder that ``tdgc.export`` wrote.
@@ -319,10 +319,10 @@ class Controller:
             reached_at = self.count
         over = self.over(self.count, reached_at)
         decides = self.count % self.decimation == 0 and not over
-        due = GRAPHS[::-1] if decides else ("low",)
+        due = ("high", "low") if decides else ("low",)
         for name in due:
             self._graphs[name].check(readings)
-        self._reached_at, self.decided, self.seconds = reached_at, decides, 0.0
+        self._reached_at, self.decided, self.seconds = reached_at, False, 0.0
         for name in due:
             graph = self._graphs[name]
             taken = {
@@ -335,7 +335,7 @@ class Controller:
             for signal, value in graph(readings | taken).items():
                 self._latest[f"{name}.{signal}"] = value
             self.seconds += graph.seconds
-        self.commands = self.low.values["commands"]
+        self.decided, self.commands = decides, self.low.values["commands"]
         self.count += 1
         return self.low.values["joint_targets"]
 

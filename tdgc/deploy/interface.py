@@ -15,7 +15,7 @@ from typing import Any
 from tdgc.config import read_json
 from tdgc.errors import InputError
 
-#: Version of the interface files; any change gets a new one, except to a description.
+#: Version of the interface files; any change gets a new one, except to a ``meaning``.
 VERSION = 5
 SCHEMA = Path(__file__).with_name("interface.schema.json")
 

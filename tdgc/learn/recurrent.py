@@ -296,11 +296,21 @@ class WholeEnvBuffer(RecurrentRolloutBuffer):
         states = self.first_memories()
         for drawn in np.array_split(np.random.permutation(self.n_envs), minibatches):
             envs = self.to_torch(drawn)
-            *parts, starts = (array.index_select(0, envs).flatten(0, 1) for array in steps)
+            obs, actions, values, log_probs, advantages, returns, starts = (
+                array.index_select(0, envs).flatten(0, 1) for array in steps
+            )
             h_pi, c_pi, h_vf, c_vf = states.index_select(2, envs)
-            memories = RNNStates((h_pi, c_pi), (h_vf, c_vf))
-            # In the order of the fields.
-            yield RecurrentRolloutBufferSamples._make((*parts, memories, starts, _Everything()))
+            yield RecurrentRolloutBufferSamples(
+                observations=obs,
+                actions=actions,
+                old_values=values,
+                old_log_prob=log_probs,
+                advantages=advantages,
+                returns=returns,
+                lstm_states=RNNStates((h_pi, c_pi), (h_vf, c_vf)),
+                episode_starts=starts,
+                mask=cast(th.Tensor, _Everything()),
+            )
 
     def by_env(self, array: NDArray[np.float32]) -> th.Tensor:
         """Swap axes: array (n_steps, n_envs, ...) -> tensor (n_envs, n_steps, ...)."""

@@ -207,8 +207,8 @@ class Policy:
 def torch_threads(number: int) -> Iterator[None]:
     """Run PyTorch on ``number`` threads, as a context manager or a decorator.
 
-    The networks are too small to parallelise: one thread costs nothing when cores are idle, is
-    several times faster when they are busy, and gives the same bits whatever the thread setting.
+    The networks are too small to parallelise: with one thread they are as fast when cores are idle,
+    several times faster when they are busy, and give the same bits whatever the thread setting.
     """
     before = th.get_num_threads()
     th.set_num_threads(number)

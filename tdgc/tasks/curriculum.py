@@ -40,7 +40,8 @@ def check_rules(window: int, threshold: int) -> None:
 
 
 class Curriculum:
-    """Levels and windows of ``n`` independent environments.
+    """Levels and windows of ``n`` independent environments; ``max_level``, the number of levels, is
+    at least 1.
 
     Attributes:
         levels: (n,), the level of each environment. ``push`` changes it; a caller with another

@@ -236,17 +236,18 @@ class NavigationTask:
     # ------------------------------------------------------------------ statistics, resume
 
     def _count(
-        self, terms: dict[str, Array], reward: Array, commands: Array, own: NDArray[np.integer]
+        self, terms: dict[str, Array], reward: Array, commands: Array, ended: NDArray[np.integer]
     ) -> None:
+        """Add a decision to ``stats``; the episodes of the robots ``ended`` rate the policy."""
         add, gait = self.stats.add, gait_index(commands)
         self.stats.add_rewards(terms, reward)
         for col, family in enumerate(self.config.families):
             mine = self.family == col
-            ended = own[mine[own]]
+            over = ended[mine[ended]]
             add(f"family/{family}/count", mine.sum())
             add(f"family/{family}/level", self.curriculum.levels[mine].sum())
-            add(f"family/{family}/episodes", ended.size)
-            add(f"family/{family}/reached", self.reached[ended].sum())
+            add(f"family/{family}/episodes", over.size)
+            add(f"family/{family}/reached", self.reached[over].sum())
             for g, name in enumerate(GAITS):
                 add(f"family/{family}/{name}", (gait[mine] == g).sum())
 

@@ -31,7 +31,8 @@ def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
     if high.behaviour == "velocities":
         # The other commands are pinned at their defaults, or at the nearest bound.
         values = CommandDecoder(ranges).nearest(default_command()).tolist()
-        pinned = {x: (values[INDEX[x]],) * 2 for x in CONTINUOUS if x not in VELOCITIES}
+        others = CONTINUOUS[len(VELOCITIES) :]
+        pinned = {name: (values[INDEX[name]], values[INDEX[name]]) for name in others}
         ranges = dataclasses.replace(ranges, **pinned)
     for f in dataclasses.fields(low.commands):
         asked, trained = getattr(ranges, f.name), getattr(low.commands, f.name)
