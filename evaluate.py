@@ -291,9 +291,8 @@ class Evaluation:
         if self.mode == "tracking":
             make_folder(self.out)
         elif self.mode == "table":
-            left = ["traces/*.parquet", "diagnosis.csv", "behaviour.csv", "tuning.json"]
-            left += [report.NAME, *(name for name, *_ in report.FIGURES)]
-            make_room(self.out, left, {"films": self.filmed > 0, "traces": self.traced is not None})
+            folders = {"films": self.filmed > 0, "traces": self.traced is not None}
+            make_room(self.out, report.DERIVED, folders)
 
 
 @dataclass(frozen=True)

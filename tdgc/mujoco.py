@@ -37,7 +37,7 @@ from tdgc.deploy.log import LogWriter
 from tdgc.errors import require, script
 from tdgc.files import checksum, write_json
 from tdgc.parallel.jobs import run_jobs
-from tdgc.show import film
+from tdgc.show import film, report
 from tdgc.sim.commands import INDEX
 from tdgc.sim.display import WindowError
 from tdgc.sim.locomotion import Locomotion
@@ -296,7 +296,7 @@ def main(arguments: list[str] | None = None) -> int:
         show(args, config)
         return 0
     folders = {"logs": args.log > 0, "films": args.video > 0}
-    make_room(args.out, ["logs/*.npz", "settings.json"], folders)
+    make_room(args.out, [*report.DERIVED, "logs/*.npz", "settings.json"], folders)
     problems = run_table(args, config)
     for problem in problems:
         print(f"tdgc.mujoco: {problem}", file=sys.stderr)

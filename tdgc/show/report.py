@@ -51,6 +51,16 @@ FIGURES = (
         "Tiles from above, one row per family, with the paths of some robots from start to goal.",
     ),
 )
+#: What else an evaluation leaves in its folder beside tables and films; it shows an older table as
+#: soon as there is a new one.
+DERIVED = (
+    "traces/*.parquet",
+    "diagnosis.csv",
+    "behaviour.csv",
+    "tuning.json",
+    NAME,
+    *(name for name, *_ in FIGURES),
+)
 
 
 def data_uri(path: Path) -> str:
