@@ -648,6 +648,26 @@ def test_from_scratch_on_terrain_of_ones_own(
 
 
 @pytest.mark.usefixtures("inline_workers")
+def test_robots_that_fall_too_often_to_be_calibrated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run says how to end it, and ends that way."""
+
+    def fall(low: policies.Policy, robots: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((1, 15)), np.zeros((1, 3))  # of the last one standing
+
+    monkeypatch.setattr(calibration, "measure", fall)
+    monkeypatch.setattr(calibration, "run_jobs", in_this_process)
+    out = ["--out", str(tmp_path)]
+    assert train_low.main([*TINY, "--steps", "32", "--set", "calibration.robots=64", *out]) == 2
+    said = "only 1 of 64 robots walked without a fall, which is too few to calibrate"
+    hint = "--resume with --set calibration.robots=0 leaves the policy as it is"
+    assert capsys.readouterr().err.endswith(f"train_low.py: {said}; {hint}\n")
+    assert train_low.main(["--resume", "--set", "calibration.robots=0", *out]) == 0
+    assert policies.load(tmp_path / "policy").meta["calibration"] == {"robots": 0}
+
+
+@pytest.mark.usefixtures("inline_workers")
 def test_calibration_ends_a_run_of_the_low_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
