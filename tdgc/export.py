@@ -18,6 +18,7 @@ import shutil
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -405,7 +406,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     seconds: list[float] = []
     log: list[tuple[bool, dict[str, Array]]] = []
     ended = True
-    try:
+    with closing(world):
         for _ in range(controller.horizon):
             if ended:
                 controller.reset()
@@ -420,8 +421,6 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
             driver.command(controller.count - 1)
             differences += _act(pair, controller, driver, executor)
             ended = bool(outcome(world, goal)[0] != GOING)
-    finally:
-        world.close()
     repeated = []
     for begins, readings in log:
         if begins:

@@ -810,6 +810,7 @@ def test_the_path_is_what_was_walked():
     for step in range(100):
         executor.step(command, batch.live)
         log.add(step)
+        batch.judge(step)
         places.append(batch.loco.world.state.position[:, :2].copy())
     batch.loco.world.close()
     walked = np.linalg.norm(np.diff(places, axis=0), axis=2).sum(axis=0)

@@ -942,6 +942,13 @@ def test_a_run_that_cannot_begin_leaves_its_folder_free(
     assert not (tmp_path / "run" / "config.json").exists()
 
 
+#: A run of train_high.py that stops at its beginning.
+UNTRAINED = [
+    "--n-envs", "4", "--workers", "1", "--set", "ppo.lstm=8", "--set", "ppo.minibatches=4",
+    "--set", "imitation.steps=0", "--time-limit", "0",
+]  # fmt: skip
+
+
 @pytest.mark.usefixtures("inline_workers")
 def test_flags_come_after_a_preset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path)]
@@ -989,12 +996,12 @@ def test_a_start_from_a_policy_of_other_settings_names_them(
     small = ["--n-envs", "4", "--workers", "1", "--set", "ppo.lstm=8", "--set", "ppo.minibatches=4"]
     small += ["--set", "imitation.steps=0", "--time-limit", "0"]
     first, slower = tmp_path / "first", tmp_path / "slower"
-    assert train_high.main([*small, "--out", str(first)]) == 0
+    assert train_high.main([*UNTRAINED, "--out", str(first)]) == 0
     begin = ["--init", str(first / "policy"), "--set", "env.commands.vx=[-1,0.8]"]
-    assert train_high.main([*small, *begin, "--seed", "7", "--out", str(slower)]) == 0
+    assert train_high.main([*UNTRAINED, *begin, "--seed", "7", "--out", str(slower)]) == 0
     assert weights(slower) == weights(first)
     fresh = tmp_path / "fresh"
-    assert train_high.main([*small, "--seed", "7", "--out", str(fresh)]) == 0
+    assert train_high.main([*UNTRAINED, "--seed", "7", "--out", str(fresh)]) == 0
     assert weights(fresh) != weights(first)
     told = [line for line in capsys.readouterr().out.splitlines() if "was trained with" in line]
     vx = "env.commands.vx=[-1.0, 1.2], not [-1.0, 0.8]"
@@ -1008,14 +1015,14 @@ def test_a_start_from_a_policy_for_another_robot_says_so(
     """Also if the policy's file does not say what it was trained with."""
     small = ["--n-envs", "4", "--workers", "1", "--set", "ppo.lstm=8", "--set", "ppo.minibatches=4"]
     small += ["--set", "imitation.steps=0", "--time-limit", "0"]
-    assert train_high.main([*small, "--out", str(tmp_path / "first")]) == 0
+    assert train_high.main([*UNTRAINED, "--out", str(tmp_path / "first")]) == 0
     first, said = policies.load(tmp_path / "first/policy"), []
     stiff = copy.deepcopy(first.meta)
     stiff["low"]["config"]["robot"]["kp"] = 25.0
     for name, meta in (("stiff", stiff), ("untold", {**first.meta, "config": {"decimation": 0}})):
         policies.save_copy(tmp_path / name, first, meta)
         begin = ["--init", str(tmp_path / name), "--out", str(tmp_path / f"from-{name}")]
-        assert train_high.main([*small, *begin]) == 0
+        assert train_high.main([*UNTRAINED, *begin]) == 0
         lines = capsys.readouterr().out.splitlines()
         said += [line for line in lines if "settings" in line or "was trained with" in line]
     assert said[0] == f"{tmp_path / 'stiff'} was trained with low.robot.kp=25.0, not 20.0"

@@ -283,8 +283,9 @@ class Batch:
         world.apply_dynamics(rows)
         start, self.goal = self.field.starts, self.field.goals + self.origin
         loco.place(rows, start[:, :2] + self.origin, start[:, 2], clock)
+        self._horizon = round(HORIZON / physics.control_dt)
         self._push_every = round(PUSH_INTERVAL / physics.control_dt)
-        number = round(HORIZON / physics.control_dt) // self._push_every + 1
+        number = self._horizon // self._push_every + 1
         self._pushes = push_velocities(cell, seed, condition.push_speed, number)
 
     @property
@@ -305,15 +306,19 @@ class Batch:
         if number and not since and self._pushes.any():
             self.loco.world.push(live, self._pushes[live, number - 1])
 
+    def judge(self, step: int) -> None:
+        """Count control step number ``step``, and end the episodes that are over after it."""
+        live, time_is_up = self.live, step + 1 == self._horizon
+        self.steps[live] = step + 1
+        self.outcome[live] = outcome(self.loco.world, self.goal, time_is_up)[live]
+
 
 class EpisodeLog:
-    """Logs a batch at every control step, decides which episodes end, and makes an ``Episode`` for
-    each robot."""
+    """Logs a batch at every control step and makes an ``Episode`` for each robot."""
 
     def __init__(self, batch: Batch) -> None:
         m, self._batch = batch.cell.count, batch
         self._dt = batch.loco.physics.control_dt
-        self._horizon = round(HORIZON / self._dt)
         self._pose_every = round(POSE_SECONDS / self._dt)
         self._path, self._energy = np.zeros(m), np.zeros(m)
         self._shares = np.zeros((m, len(GAITS)))
@@ -321,8 +326,7 @@ class EpisodeLog:
         self._position = batch.loco.world.state.position[:, :2].copy()
 
     def add(self, step: int) -> None:
-        """Log the state of the robots after control step number ``step``, and end the episodes that
-        are over, in the batch's ``outcome``.
+        """Log the state of the robots after control step number ``step``, before it is judged.
 
         Raises:
             FloatingPointError: a robot's position is not finite. In Bullet, the other robots would
@@ -336,9 +340,6 @@ class EpisodeLog:
         self._position = position
         self._energy[live] += self._dt * state.power[live]
         self._shares[live, gait_index(batch.loco.command[live])] += 1.0
-        batch.steps[live] = step + 1
-        time_is_up = step + 1 == self._horizon
-        batch.outcome[live] = outcome(batch.loco.world, batch.goal, time_is_up)[live]
         if (step + 1) % self._pose_every == 0:
             self._poses.append(self._pose())
 
@@ -406,6 +407,7 @@ def closed_loop(
         # At each control step: commands -> low policy -> joint targets -> physics.
         executor.step(commands, live)
         log.add(step)
+        batch.judge(step)
         for watcher in watchers:
             watcher.step(step, live)
         batch.loco.world.retire(np.setdiff1d(live, batch.live))

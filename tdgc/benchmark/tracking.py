@@ -2,6 +2,7 @@
 
 import operator
 from collections.abc import Iterator
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -54,14 +55,12 @@ def walk_on_plane(low: Policy, m: int, seconds: float, seed: int) -> Iterator[Lo
     rng = np.random.default_rng(seed)
     spots = 5.0 * np.stack([rows % 10, rows // 10], axis=1).astype(np.float64)
     loco.place(rows, spots, rng.uniform(-np.pi, np.pi, m), rng.uniform(size=m))
-    try:
+    with closing(loco.world):
         for _ in range(round(seconds / config.physics.control_dt)):
             yield loco
             executor.step(loco.command)
             if not np.isfinite(loco.world.state.position).all():
                 raise FloatingPointError("a robot's state is not finite: the simulation diverged")
-    finally:
-        loco.world.close()
 
 
 def track_gait(low: Policy, gait: str, episodes: int, seed: int) -> dict[str, float]:

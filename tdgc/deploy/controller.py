@@ -42,6 +42,7 @@ class Graph:
     Attributes:
         table: contents of the interface file.
         memory: values for the inputs that are carried over from the previous step, by name.
+        sources: outputs of the other graph, as "graph.name", by the inputs that take them.
         values: all inputs and outputs of the last step, by name.
         seconds: CPU time of the last step, which is its latency on a dedicated core.
     """
@@ -52,6 +53,7 @@ class Graph:
         self._inputs = [s["name"] for s in inputs]
         self._outputs = [s["name"] for s in self.table["outputs"]]
         self._kept = {s["name"]: s["previous"] for s in inputs if s["previous"] is not None}
+        self.sources = {s["name"]: s["source"] for s in inputs if s["source"] is not None}
         self._start = {s["name"]: _start(s) for s in inputs if s["start"] is not None}
         self._run = _RUNTIMES[form](graph_file(folder, self.table, form), self.table)
         self.reset()
@@ -326,9 +328,9 @@ class Controller:
         for name in due:
             graph = self._graphs[name]
             taken = {
-                signal["name"]: self._latest[signal["source"]]
-                for signal in graph.table["inputs"]
-                if signal["source"] in self._latest
+                name: self._latest[source]
+                for name, source in graph.sources.items()
+                if source in self._latest
             }
             if name == "low" and over:
                 taken["commands"] = self._stand

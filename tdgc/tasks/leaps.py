@@ -8,6 +8,7 @@ the best position within reach. Feet land close to Raibert's footholds; how far 
 low policies by a few centimetres, so it is measured.
 """
 
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -350,7 +351,7 @@ def measure_landing(low: "Policy", config: LowLevelConfig, speed: float) -> Land
     places = np.column_stack([np.zeros(_ROBOTS), 2.0 * rows])
     loco.place(rows, places, np.zeros(_ROBOTS), np.linspace(0.0, 1.0, _ROBOTS, endpoint=False))
     landing, up, executor = Landing(), rows, Executor(loco, low)
-    try:
+    with closing(loco.world):
         for step in range(round(_SECONDS / dt)):
             state = loco.world.state
             loco.command[:, INDEX["yaw_rate"]] = np.clip(-state.yaw, *config.commands.yaw_rate)
@@ -359,6 +360,4 @@ def measure_landing(low: "Policy", config: LowLevelConfig, speed: float) -> Land
             up = np.flatnonzero(state.position[:, 2] > 0.5 * config.robot.base_height)
             if step * dt > _SETTLE and up.size:
                 landing.learn(loco, up, before[up], _RATE)
-    finally:
-        loco.world.close()
     return landing if up.size >= _STANDING * _ROBOTS else None

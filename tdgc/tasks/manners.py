@@ -7,6 +7,7 @@ with faster steps, and slower leaps (docs/experiments.md).
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from contextlib import closing
 
 import numpy as np
 
@@ -130,7 +131,7 @@ def arrivals(
     skill = Skill(landing, manner)
     task = NavigationTask(config, low, robots, _SEED, training=False, taught=skill, led=np.inf)
     lost = np.zeros(robots, dtype=bool)
-    try:
+    with closing(task):
         task.reset(np.arange(robots))
         for _ in range(task.horizon):
             if not np.isfinite(task.observe()).all():  # the teacher decides
@@ -140,5 +141,3 @@ def arrivals(
             if (lost | task.reached).all():
                 break
         return int((task.reached & ~lost).sum())
-    finally:
-        task.close()
