@@ -40,7 +40,7 @@ from tdgc.benchmark.results import (
 from tdgc.benchmark.trace import Selection, Trace, Tracer, write
 from tdgc.benchmark.tracking import tracking
 from tdgc.benchmark.tuning import TunedDriver, Tuning
-from tdgc.config import ConfigError, HighLevelConfig, LowLevelConfig
+from tdgc.config import HighLevelConfig, LowLevelConfig
 from tdgc.errors import require, script
 from tdgc.files import make_folder, write_csv, write_json
 from tdgc.parallel import cluster
@@ -53,7 +53,7 @@ from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.geometry import read_geometry
 from tdgc.tasks.leaps import measure_landing
 from tdgc.tasks.manners import find_manner, manner_of, within
-from tdgc.tasks.pairing import PRETRAINED, load_low, mdp_of
+from tdgc.tasks.pairing import PRETRAINED, MisfitError, load_low, mdp_of
 from tdgc.tasks.teacher import Skill
 
 POLICIES = ("tdgc", "gp")
@@ -107,7 +107,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         const="drive",
         choices=gui.MODES,
         help="open Bullet's window instead, on the first tile of the first family and level: "
-        "drive the low policy with sliders (drive), or watch the first policy decide (watch)",
+        "drive the low policy with sliders (drive), or watch the first policy decide (watch); "
+        "--episodes, --workers and --out have no effect then",
     )
     groups.machine.add_argument("--cluster", metavar="ADDRESS", help=CLUSTER_HELP)
     return parser.parse_args(arguments)
@@ -243,12 +244,15 @@ class Evaluation:
 
         They command it as the teacher of the high policy did. Without a high policy that fits, what
         suits the low policy is tried out.
+
+        Raises:
+            ValueError: the high policy's file cannot be used.
         """
         try:
             if self.high is None:
-                raise ConfigError("there is no high policy")
+                raise MisfitError("there is no high policy")
             high, _ = load_high(self.high, low, config)
-        except ConfigError as error:
+        except MisfitError as error:
             print(f"{error}: trying out how the low policy walks and leaps best")
             manner = within(find_manner(low, HighLevelConfig(), print), config.commands)
         else:

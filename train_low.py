@@ -44,7 +44,7 @@ from tdgc.sim.robot import fitted
 from tdgc.sim.terrain import EDITION
 from tdgc.tasks.low_env import make_task
 from tdgc.tasks.low_observation import low_mirror, low_spaces
-from tdgc.tasks.rules import episode_steps
+from tdgc.tasks.rules import FALL_HEIGHT, episode_steps
 from tdgc.tasks.statistics import summarise_low
 from tdgc.tasks.tiles import check_tiles, left_out
 
@@ -84,6 +84,12 @@ def check(config: LowTrainConfig) -> None:
         raise ConfigError(
             f"'calibration.robots' must be 0 or at least {LEAST_ROBOTS}, "
             f"not {config.calibration.robots}"
+        )
+    lowest = config.env.robot.base_height + config.env.commands.body_height[0]
+    if lowest <= FALL_HEIGHT:
+        raise ConfigError(
+            f"'env.robot.base_height' plus the lowest 'env.commands.body_height' must be above "
+            f"{FALL_HEIGHT:g} m, below which a robot has fallen, not {lowest:.3g}"
         )
     check_tiles(config.env.families, config.env.levels)
     check_robot(config.env.robot, config.env.physics, config.env.randomisation)

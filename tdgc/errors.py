@@ -53,10 +53,10 @@ P = ParamSpec("P")
 
 
 def script(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
-    """Decorate a script's ``main``: whatever stops it becomes one line that begins with ``name``.
+    """Decorate a script's ``main``: what stops it becomes one line that begins with ``name``.
 
     The exit status is 2 for input that cannot be used, a ``ValueError``, and 1 for ``FAILURES`` and
-    Ctrl-C.
+    Ctrl-C. Any other exception is a defect and keeps its traceback.
     """
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:

@@ -13,6 +13,7 @@ policies.
 
 import argparse
 import dataclasses
+import io
 import json
 import shutil
 import sys
@@ -338,7 +339,9 @@ def _write_graph(graph: LowGraph | HighGraph, path: Path) -> None:
     with quiet():
         if path.suffix == FORMATS["torchscript"]:
             traced = th.jit.trace(graph, example)  # type: ignore[no-untyped-call]
-            th.jit.save(traced, path)
+            content = io.BytesIO()  # written here, as PyTorch aborts the process on a full disk
+            th.jit.save(traced, content)
+            path.write_bytes(content.getvalue())
             return
         program = th.onnx.export(
             graph,

@@ -85,6 +85,8 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, An
         writer = csv.DictWriter(file, list(columns))
         writer.writeheader()
         writer.writerows(rows)
+        file.flush()
+        os.fsync(file.fileno())  # so that the rename never outlives the content
 
 
 def make_folder(folder: Path) -> None:

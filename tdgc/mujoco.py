@@ -184,7 +184,7 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
         Exception: one of ``FAILURES``; the table of the complete cells is still written.
     """
     settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
-    write_json(args.out / "settings.json", settings)
+    write_json(args.out / "mujoco.json", settings)
     cells = plan([POLICY], ["nominal"], args.families, args.levels, args.episodes)
     work = functools.partial(
         run_cell,
@@ -296,7 +296,7 @@ def main(arguments: list[str] | None = None) -> int:
         show(args, config)
         return 0
     folders = {"logs": args.log > 0, "films": args.video > 0}
-    make_room(args.out, [*report.DERIVED, "logs/*.npz", "settings.json"], folders)
+    make_room(args.out, report.DERIVED, folders)
     problems = run_table(args, config)
     for problem in problems:
         print(f"tdgc.mujoco: {problem}", file=sys.stderr)

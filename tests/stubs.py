@@ -1,6 +1,8 @@
 """Stand-ins. Worker processes of tests import this file, so it imports little."""
 
+import contextlib
 import os
+import resource
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -196,3 +198,14 @@ def no_task(config: Any, robots: int, seed: int, first: int) -> Any:
 def in_this_process(work: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[Any]:
     """As ``run_jobs``, without processes, which take seconds to import PyTorch."""
     return map(work, jobs)
+
+
+@contextlib.contextmanager
+def no_file_larger_than(size: int) -> Iterator[None]:
+    """Make writes beyond ``size`` bytes of a file fail, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

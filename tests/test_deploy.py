@@ -645,6 +645,17 @@ def test_a_timeout_lasts_to_the_horizon(
         assert log.outcome(found, controller, told) == ended
 
 
+def test_a_fall_after_the_episode_is_not_diagnosed(
+    controller: Controller, arrival: tuple[Path, list[int]]
+) -> None:
+    """The last decision is that of row 110, 2 s after the goal; the log ends 0.4 s later."""
+    found = log.read(arrival[0], controller)
+    said = "^arrival: no decision after 2.20 s led to what happened at 2.60 s: it was no longer"
+    with pytest.raises(LogError, match=said):
+        log.trace(found, controller, "fell")
+    assert log.trace(found, controller).outcome == "reached"
+
+
 def test_each_value_is_compared_with_the_graphs(
     controller: Controller, arrival: tuple[Path, list[int]]
 ) -> None:

@@ -180,6 +180,33 @@ def test_a_timeout_is_judged_by_all_of_it_and_other_ends_by_their_last_seconds()
     assert verdict(late) == ("decisions", "found no way to the goal")
 
 
+def held_at_a_pillar(outcome: str, free: float, **errors: float) -> Trace:
+    """A walk of ``free`` s with tracking ``errors`` to a pillar, where it ends after 20 s."""
+    px, py, diameter = tile_of(0, "pillar", 6, 0).features.pillars[0]
+    x = px - 0.5 * diameter - 0.3
+    n = round(10 * free)
+    trace = walk("pillar", 6, outcome, 20.0, ((x, py), (x, py)))
+    trace["base_x"][: n + 11] = 0.9
+    for name, value in errors.items():
+        trace[name][: n + 11] = value
+    return trace
+
+
+def test_a_timeout_that_is_hardly_tracked_is_judged_as_a_stretch() -> None:
+    """Means over little time vary more, so 1.2 s before a pillar have the limit of 2 s, 0.24 m/s,
+    not that of an episode, 0.13 m/s."""
+    stuck = "decisions", "held up by a pillar"
+    assert verdict(held_at_a_pillar("timeout", 1.2, error_vx=-0.16)) == stuck
+    lost = "execution", "lost track of velocity"
+    assert verdict(held_at_a_pillar("timeout", 3.0, error_vx=-0.16)) == lost
+    assert verdict(held_at_a_pillar("timeout", 1.2, error_vx=-0.25)) == lost
+
+
+def test_who_falls_at_a_pillar_was_steered_into_it() -> None:
+    for outcome in ("fell", "collided"):
+        assert verdict(held_at_a_pillar(outcome, 3.0)) == ("decisions", "steered into a pillar")
+
+
 def test_speeding_up_from_rest_does_not_count():
     start = walk(seconds=1.5)
     start["error_vx"][1:11] = -1.0

@@ -457,8 +457,9 @@ def test_two_maps_whose_files_would_have_the_same_names(tmp_path, monkeypatch, c
 def test_a_policy_of_the_wrong_kind(high, capsys):
     assert evaluate.main(["--low", str(high)]) == 2
     assert capsys.readouterr().err.endswith("high: not a low policy of this package\n")
-    assert evaluate.main(["--high", str(PRETRAINED / "low")]) == 2
-    assert capsys.readouterr().err.endswith("low: not a high policy of this package\n")
+    for policy in ("tdgc", "teacher"):  # whose manner of walking is in the file
+        assert evaluate.main(["--policies", policy, "--high", str(PRETRAINED / "low")]) == 2
+        assert capsys.readouterr().err.endswith("low: not a high policy of this package\n")
 
 
 def test_an_evaluation_checks_itself():

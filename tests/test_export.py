@@ -17,6 +17,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stubs import no_file_larger_than
 
 from tdgc import export, policies
 from tdgc.config import HighLevelConfig, LowLevelConfig, RandomisationConfig, RobotConfig, to_dict
@@ -626,6 +627,13 @@ def test_a_robot_needs_no_part_of_this_package(folder: Path) -> None:
     wanted = run(graph, {s.name: np.full(s.size, 0.3) for s in graph.inputs})["joint_targets"]
     for targets in json.loads(result.stdout):
         assert targets == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_full_disk_stops_an_export(tmp_path: Path) -> None:
+    """PyTorch itself would end the process without an error that could be caught."""
+    pair = export.load_pair(LOW, random_high(tmp_path / "high", HIGH_CONFIG))
+    with no_file_larger_than(10_000), pytest.raises(OSError, match="File too large"):
+        export.write(pair, tmp_path, ["torchscript"])
 
 
 def test_a_correction_is_part_of_the_graph(tmp_path: Path) -> None:

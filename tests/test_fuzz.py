@@ -434,7 +434,7 @@ def checkpoint(folder: Path) -> tuple[Path, bytes, bytes]:
     tensors = {"policy.a": th.arange(6.0).reshape(2, 3), "random.torch": th.tensor([1, 2, 3])}
     header = {
         "format": "tdgc-checkpoint",
-        "version": 16,
+        "version": 17,
         "n_updates": 3,
         "random": {"numpy": [1, 0, 0.5], "kind": "MT19937"},
         "workers": [{"epoch": 3, "position": {"array": "extra.workers.0.position"}}],

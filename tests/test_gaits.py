@@ -10,6 +10,7 @@ from tdgc.sim.gaits import (
     GAIT_TABLE,
     GAITS,
     PhaseClock,
+    begun,
     desired_contact,
     foot_phases,
     gait_embedding,
@@ -179,9 +180,9 @@ def test_swing_grows_over_the_first_cycles_of_a_gait() -> None:
     np.testing.assert_allclose(clock.swing(0.5)[0], [0.8 * height, 0, 0, 0.8 * height], atol=1e-12)
     np.testing.assert_allclose(clock.swing(0.2)[0], [height, 0, 0, height], atol=1e-12)
     assert (clock.swing(0.0) == swing_profile(clock.phases)).all()
-    np.testing.assert_allclose(clock.begun(2.0), [0.2, 0.4], atol=1e-12)
-    np.testing.assert_allclose(clock.begun(0.5), [0.8, 1.0], atol=1e-12)
-    assert clock.begun(0.0).tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(begun(clock.cycles, 2.0), [0.2, 0.4], atol=1e-12)
+    np.testing.assert_allclose(begun(clock.cycles, 0.5), [0.8, 1.0], atol=1e-12)
+    assert begun(clock.cycles, 0.0).tolist() == [1.0, 1.0]
     clock.update(pronk, duty)  # the second robot changes its gait
     np.testing.assert_allclose(clock.cycles, [0.4, 0.0], atol=1e-12)
     assert (clock.swing(1.0)[1] == 0.0).all() and (clock.swing(0.0)[1] == 0.0).sum() == 0

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tdgc.config import CommandRanges
+from tdgc.config import CommandRanges, LowLevelConfig, RobotConfig
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX
 from tdgc.sim.locomotion import Locomotion
@@ -31,6 +31,8 @@ from tdgc.tasks.pairing import PRETRAINED, load_low
 LOW = PRETRAINED / "low"
 RANGES = CommandRanges()
 LANDING = Landing(-0.02, 0.08)
+#: Cycles after which a gait has slowed down to the commanded frequency.
+LATE = np.full(1, 9.0)
 
 
 def land(
@@ -42,7 +44,7 @@ def land(
     of ``LeapPlan`` that decides, ten times a second.
     """
     speed = 0.95 * SPEED
-    plan = LeapPlan(1, RANGES)
+    plan = LeapPlan(1, RANGES, RobotConfig())
     plan.look(0, trenches, LANDING.spread)
     one, front, rear, length = np.ones(1), [], [], STRIDE
     frequency = SPEED / STRIDE
@@ -50,7 +52,7 @@ def land(
         if step % 5 == 0:
             row = np.zeros(1, dtype=int)
             motion = Motion(
-                x * one, speed * one, SPEED * one, clock * one, frequency * one, length * one
+                x * one, speed * one, SPEED * one, clock * one, LATE, frequency * one, length * one
             )
             f, wanted = getattr(plan, choice)(row, motion, LANDING)[:2]
             frequency, length = float(f[0]), float(wanted[0])
@@ -101,6 +103,47 @@ def test_speeding_up() -> None:
     assert way[0] == pytest.approx(steps, abs=1e-5)
 
 
+@pytest.mark.parametrize("start_cycles", [2.0, 0.5, 0.0])
+def test_the_first_landings_are_planned_for_the_frequency_carried_out(start_cycles: float) -> None:
+    """A gait that is commanded at 2.5 Hz starts at 3.5: the plan knows when the feet touch down, to
+    5 ms, and the frequency then, to 2 %, as a robot's clock advances."""
+    robot = RobotConfig(start_cycles=start_cycles)
+    plan = LeapPlan(3, CommandRanges(frequency=(2.5, 4.0)), robot)
+    world = BulletWorld(3, robot, LowLevelConfig().physics)
+    loco = Locomotion(world, LowLevelConfig(robot=robot))
+    world.close()
+    leap_command(loco.command, 2.5, STRIDE, RANGES)
+    loco.update_clock()
+    loco.clock.reset(np.arange(3), np.array([0.0, 0.5, 0.9]))
+    for landing in range(4):
+        motion = Motion.of(loco, np.arange(3), np.zeros(3), np.ones(3), np.ones(3))
+        planned, wanted = (found[:, 0] for found in plan._touchdown(motion))
+        seconds = np.zeros(3)
+        todo, before = np.ones(3, dtype=bool), loco.clock.clock
+        while todo.any():
+            frequency = np.where(todo, loco.executed()[:, INDEX["frequency"]], 0.0)
+            loco.clock.advance(0.001, frequency, loco.command[:, 12:], np.full(3, 0.55))
+            seconds += 0.001 * todo
+            todo &= loco.clock.clock >= before
+            before = loco.clock.clock
+        np.testing.assert_allclose(seconds, planned, atol=5e-3, err_msg=str(landing))
+        carried_out = loco.executed()[:, INDEX["frequency"]]
+        np.testing.assert_allclose(carried_out, wanted, rtol=0.02)
+        assert (carried_out > 2.51).all() == (landing == 0 and start_cycles == 2.0)
+
+
+def test_a_leap_begins_with_the_gait() -> None:
+    """A robot that trots has leapt for no cycle, whatever its clock."""
+    world = BulletWorld(2, RobotConfig(), LowLevelConfig().physics)
+    loco = Locomotion(world, LowLevelConfig())
+    world.close()
+    leap_command(loco.command[1:], 3.0, STRIDE, RANGES)
+    loco.update_clock()
+    loco.clock.advance(0.1, np.full(2, 3.0), loco.command[:, 12:], np.full(2, 0.55))
+    one = np.ones(2)
+    np.testing.assert_allclose(Motion.of(loco, np.arange(2), one, one, one).cycles, [0.0, 0.3])
+
+
 def test_without_trenches_strides_are_the_usual_ones() -> None:
     front, rear = land(np.empty((0, 2)))
     np.testing.assert_allclose(np.diff(front), STRIDE, atol=0.03)
@@ -118,9 +161,9 @@ def test_risk_of_a_foothold() -> None:
 
 def test_a_slow_robot_is_timed_for_the_speed_of_a_leap() -> None:
     """A slow robot's stride is timed for ``SPEED``: robots that leap at 2 Hz from rest fall."""
-    plan = LeapPlan(1, RANGES)
+    plan = LeapPlan(1, RANGES, RobotConfig())
     one, row = np.ones(1), np.zeros(1, dtype=int)
-    motion = Motion(one, 0.1 * one, SPEED * one, 0.0 * one, 3.0 * one, STRIDE * one)
+    motion = Motion(one, 0.1 * one, SPEED * one, 0.0 * one, LATE, 3.0 * one, STRIDE * one)
     frequency, _ = plan.steps(row, motion, LANDING)
     assert frequency[0] == pytest.approx(SPEED / STRIDE, abs=0.09)
 
@@ -132,7 +175,7 @@ def test_what_is_imitated_depends_smoothly_on_the_speed() -> None:
     stance length, and below 1.1 of it for the frequency.
     """
     trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
-    plan, speeds = LeapPlan(1, RANGES), np.arange(0.9, 1.3, 0.01)
+    plan, speeds = LeapPlan(1, RANGES, RobotConfig()), np.arange(0.9, 1.3, 0.01)
     plan.look(0, trenches, LANDING.spread)
     rows, one = np.zeros(len(speeds), dtype=int), np.ones(len(speeds))
     changes = [
@@ -140,7 +183,9 @@ def test_what_is_imitated_depends_smoothly_on_the_speed() -> None:
             np.diff(
                 choose(
                     rows,
-                    Motion(x * one, speeds, SPEED * one, 0.3 * one, 3.0 * one, STRIDE * one),
+                    Motion(
+                        x * one, speeds, SPEED * one, 0.3 * one, LATE * one, 3.0 * one, STRIDE * one
+                    ),
                     LANDING,
                 )[:2]
             )
@@ -159,11 +204,11 @@ def test_prices_of_strides() -> None:
     The cheapest frequency depends on the stance length, so prices depend on both together.
     """
     trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
-    plan = LeapPlan(1, RANGES)
+    plan = LeapPlan(1, RANGES, RobotConfig())
     plan.look(0, trenches, LANDING.spread)
     x = np.arange(0.8, trenches[-1, 0], 0.01)
     rows, one = np.zeros(len(x), dtype=int), np.ones(len(x))
-    motion = Motion(x, SPEED * one, SPEED * one, 0.2 * one, 3.0 * one, STRIDE * one)
+    motion = Motion(x, SPEED * one, SPEED * one, 0.2 * one, LATE * one, 3.0 * one, STRIDE * one)
     taught = plan.lesson(rows, motion, LANDING)
     assert taught.price.shape == (len(x), FREQUENCIES, LENGTHS)
     np.testing.assert_array_equal(taught.price.min(axis=(1, 2)), 0.0)
@@ -182,9 +227,9 @@ def test_prices_of_strides() -> None:
 def test_price_of_a_stride_on_flat_ground() -> None:
     """Off by d m from the usual stride 10 d^2, off by d m in stance length 2 d^2, changed by d Hz
     0.5 d^2, and 4 where the stride is longer than 0.48 m."""
-    plan, one = LeapPlan(1, RANGES), np.ones(1)
+    plan, one = LeapPlan(1, RANGES, RobotConfig()), np.ones(1)
     plan.look(0, np.empty((0, 2)), 0.0)
-    motion = Motion(one, SPEED * one, SPEED * one, 0.0 * one, 2.6 * one, STRIDE * one)
+    motion = Motion(one, SPEED * one, SPEED * one, 0.0 * one, LATE, 2.6 * one, STRIDE * one)
     price = plan.lesson(np.zeros(1, dtype=int), motion, Landing()).price[0]
     f = np.linspace(*RANGES.frequency, FREQUENCIES)[:, None]
     length = np.linspace(*RANGES.stance_length, LENGTHS)
@@ -230,11 +275,16 @@ def test_a_robot_that_blew_up_teaches_no_landing() -> None:
     for blown, rows in ((None, [1]), (np.nan, [0, 1]), (1e4, [0, 1])):
         loco.place(np.arange(2), np.zeros((2, 2)), np.zeros(2), np.full(2, 0.3))
         loco.command[:, INDEX["frequency"]] = 2.0
+        loco.clock.cycles[:] = 1.0
         if blown is not None:
             loco.world.state.foot_position[0] = blown
         landing = Landing()
         landing.learn(loco, np.array(rows), np.full(len(rows), 0.1), rate=0.1)
         landings.append((landing.front, landing.spread))
+        first = Landing()
+        loco.clock.cycles[:] = 0.9  # it was placed with its clock there: no leap has ended
+        first.learn(loco, np.array(rows), np.full(len(rows), 0.1), rate=0.1)
+        assert first == Landing()
     loco.world.close()
     assert landings[1] == landings[2] == landings[0] != (0.0, 0.0)
 
@@ -251,12 +301,12 @@ def test_who_pushes_off_has_decided(choice: str) -> None:
     Before that, some robots in front of a trench change their stride.
     """
     trenches = make_tile("gap", 0.8, np.random.default_rng(0)).features.trenches
-    plan = LeapPlan(1, RANGES)
+    plan = LeapPlan(1, RANGES, RobotConfig())
     plan.look(0, trenches, LANDING.spread)
     x = np.arange(0.8, trenches[-1, 0], 0.05)
     rows, one = np.zeros(len(x), dtype=int), np.ones(len(x))
     for clock, same in ((0.39, False), (0.4, True), (0.9, True)):
-        motion = Motion(x, SPEED * one, SPEED * one, clock * one, 2.9 * one, 0.36 * one)
+        motion = Motion(x, SPEED * one, SPEED * one, clock * one, LATE * one, 2.9 * one, 0.36 * one)
         chosen = getattr(plan, choice)(rows, motion, LANDING)
         assert (np.allclose(chosen[0], 2.9) and np.allclose(chosen[1], 0.36)) == same
         if choice == "lesson":

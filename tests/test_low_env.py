@@ -258,6 +258,11 @@ def test_statistics_of_a_run() -> None:
     assert values["reward/total"] == pytest.approx(sums["reward"] / 12)
     assert values["falls_per_minute"] == pytest.approx(3 / (12 * 0.02 / 60))
     assert values["command_share/trot"] == 1.0
+    for gait in GAITS:  # none walked is not tracked perfectly
+        error = values.get(f"tracking/{gait}_velocity_rmse", 0.0)
+        assert (error > 0.0) == (sums[f"gait/{gait}/steps"] > 0)
+    walked = [sums[f"gait/{gait}/steps"] > 0 for gait in GAITS]
+    assert any(walked) and not all(walked)
     task.close()
 
 

@@ -151,7 +151,7 @@ def test_vertical_velocity_and_tilt_rate() -> None:
 def raibert(phase: float, duration: float = 0.5, frequency: float = 2.0, **command: float) -> Array:
     """Footholds of one robot with all feet at the same phase, (4, 2) m."""
     step = set_command(low_step(), duration=duration, frequency=frequency, **command)
-    return rewards.raibert_targets(step.command[1:], np.full((1, 4), phase), step.stance)[0]
+    return rewards.raibert_targets(step.command[1:], np.full((1, 4), phase), step.stance, 0.0)[0]
 
 
 RECTANGLE = np.array([[0.19, 0.125], [0.19, -0.125], [-0.19, 0.125], [-0.19, -0.125]])
@@ -168,9 +168,10 @@ def test_raibert_rests_at_another_robots_stance() -> None:
     """At the default commands; others move the feet as far from there as from ours."""
     command, phases = low_step().command, np.full((2, 4), 0.25)
     command[1, INDEX["stance_width"]] += 0.08
-    made = rewards.raibert_targets(command, phases, (0.6, 0.4))
     signs = np.sign(GEOMETRY.hips)
-    np.testing.assert_allclose(made, [signs * [0.3, 0.2], signs * [0.3, 0.24]], atol=1e-12)
+    for centre in (0.0, -0.06):  # hips that are further behind
+        made = rewards.raibert_targets(command, phases, (0.6, 0.4), centre) - [centre, 0.0]
+        np.testing.assert_allclose(made, [signs * [0.3, 0.2], signs * [0.3, 0.24]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

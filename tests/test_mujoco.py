@@ -478,6 +478,7 @@ def test_the_end_is_told_or_seen(
     assert log.outcome(reached, controller) == log.outcome(reached, controller, "reached")
     assert log.outcome(reached, controller) == "reached"
     assert log.outcome(reached, controller, "fell") == "fell"  # into the goal's circle
+    assert log.outcome(reached, controller, "left_tile") == "left_tile"  # the simulator's tile
     with pytest.raises(LogError, match="near: reaches the goal, so it has not run out of time"):
         log.outcome(reached, controller, "timeout")
 
@@ -524,7 +525,7 @@ def test_the_benchmark_writes_what_evaluate_writes(folder: Path, tmp_path: Path)
     found = summary[runner.POLICY]["nominal"]["mean"]
     reached = sum(row["outcome"] == "reached" for row in rows)
     assert (found["n"], found["reached"]) == (4, reached)
-    settings = json.loads((tmp_path / "settings.json").read_text())["mujoco"]
+    settings = json.loads((tmp_path / "mujoco.json").read_text())["mujoco"]
     assert (settings["armature"], settings["friction"], settings["solref"]) == (0.005, 0.7, 0.005)
     logs = sorted(path.name for path in (tmp_path / "logs").iterdir())
     assert logs == [f"tdgc-mujoco_nominal_{family}_09_000.npz" for family in ("gap", "rough")]
@@ -574,7 +575,7 @@ def test_what_is_complete_when_it_is_stopped_is_kept(
         assert runner.main(given) == 1
     lines = capsys.readouterr().err.splitlines()
     assert lines[-1] == f"tdgc.mujoco: {message}" and "Traceback" not in "".join(lines)
-    tables = {path.name for path in tmp_path.iterdir()} - {"settings.json"}
+    tables = {path.name for path in tmp_path.iterdir()} - {"mujoco.json"}
     if not after:
         assert not tables
         return

@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import pickle
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +17,7 @@ from gymnasium import spaces
 from sb3_contrib.ppo_recurrent.policies import MlpLstmPolicy
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stubs import no_file_larger_than
 from torch import nn
 
 from tdgc import policies
@@ -363,13 +363,8 @@ def test_files_are_replaced_not_written_over(saved):
 
 def test_failed_write_leaves_the_old_policy_and_no_scraps(saved):
     before = policies.load(saved)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # like a full disk
-    try:
-        with pytest.raises(OSError, match=r"File too large"):
-            policies.save(saved, mlp_policy(), {"seed": 1})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with no_file_larger_than(1000), pytest.raises(OSError, match=r"File too large"):
+        policies.save(saved, mlp_policy(), {"seed": 1})
     assert len(list(saved.parent.iterdir())) == 2
     after = policies.load(saved)
     assert after.meta == {"seed": 42}

@@ -125,11 +125,12 @@ def test_the_table_says_which_edition_a_policy_was_trained_on(tmp_path: Path) ->
 
 
 def test_the_table_says_what_differs_from_the_benchmarks_robot(tmp_path: Path) -> None:
-    """Its motors, gains and physics are named; what belongs to the low policy is not."""
+    """Its motors, gains and control step are named, but nothing that belongs to the low policy, and
+    no physics that the evaluation replaces."""
     config = LowLevelConfig()
     assert robot_changes(config) == []
     robot = dataclasses.replace(config.robot, kp=18.6, action_scale=0.5, joint_margin=None)
-    physics = dataclasses.replace(config.physics, control_dt=0.01)
+    physics = dataclasses.replace(config.physics, control_dt=0.01, hold=1, friction=1.2)  # replaced
     changes = robot_changes(dataclasses.replace(config, robot=robot, physics=physics))
     assert changes == ["robot.kp=18.6, not 20.0", "physics.control_dt=0.01, not 0.02"]
     summary = write_results(tmp_path, EPISODES, Training({"low": 2, "high": 2}, changes))

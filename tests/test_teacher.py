@@ -50,7 +50,7 @@ class Course:
 
     def lead(self, landing: Landing | None) -> None:
         """Start an episode with a teacher of a low policy with this ``landing``."""
-        self.teacher = Teacher(self.field, CommandRanges(), Skill(landing))
+        self.teacher = Teacher(self.field, CommandRanges(), RobotConfig(), Skill(landing))
         self.teacher.begin(np.arange(len(self.origin)), self.goal)
 
     def put(self, x: float, y: float = 4.0, yaw: float = 0.0) -> None:
@@ -91,6 +91,19 @@ def test_the_ground_decides_how_to_walk(course) -> None:
     np.testing.assert_allclose(decoder.decode(decoder.encode(commands)), commands)
 
 
+def test_only_leaps_are_expected_to_speed_up(course) -> None:
+    """At 0.6 m/s, a robot that walks is taken to do so; of one that leaps, more is expected."""
+    course = course([trench])
+    speeds = []
+    for x in (1.0, 3.0):  # it leaps from 2.85 m on
+        course.put(x)
+        course.loco.world.state.heading_vel[:, 0] = 0.6
+        for _ in range(20):
+            course.teacher.watch(course.loco, 0.1)
+        speeds.append(course.teacher.speed[0])
+    assert speeds[0] == pytest.approx(0.6) and speeds[1] > 0.7
+
+
 def test_goes_uphill_across_a_slope(course) -> None:
     course = course(["tilt", "rough"])
     slope = course.field.features[0].slope
@@ -124,7 +137,7 @@ def test_walks_as_on_a_slope_only_near_it(course) -> None:
 def test_among_obstacles_it_is_a_sixth_slower(course, walk_speed: float, expected: float) -> None:
     course = course(["pillar"])
     skill = Skill(None, TeacherConfig(walk_speed=walk_speed))
-    course.teacher = Teacher(course.field, CommandRanges(), skill)
+    course.teacher = Teacher(course.field, CommandRanges(), RobotConfig(), skill)
     course.teacher.begin(np.arange(1), course.goal)
     course.put(1.0)
     assert np.hypot(*course.commands()[0, :2]) == pytest.approx(expected)

@@ -122,6 +122,7 @@ def test_a_tile_of_a_height_map(tmp_path):
         (None, "cannot be read as a NumPy file"),
         (b"no array", "cannot be read as a NumPy file"),
         (b"PK\x03\x04, half a zip", "cannot be read as a NumPy file"),
+        (b"\x93NUMPY\x01\x00\x06\x00{'a(\n\n", "cannot be read as a NumPy file"),
         (np.zeros((161, 160)), r"must hold finite heights in m, an array \(161, 161\)$"),
         (np.full((161, 161), np.nan), "must hold finite heights"),
         (np.zeros((161, 161), dtype=bool), "must hold finite heights"),
@@ -129,7 +130,7 @@ def test_a_tile_of_a_height_map(tmp_path):
         (np.full((161, 161), -128, dtype=np.int8), r"must stay within 2\.08333 m"),
         (np.full((161, 161), -2.1), r"must stay within 2\.08333 m of the platforms' height$"),
     ],
-    ids=["none", "text", "zip", "shape", "nan", "bool", "pickle", "int8", "deep"],
+    ids=["none", "text", "zip", "header", "shape", "nan", "bool", "pickle", "int8", "deep"],
 )
 def test_a_height_map_that_cannot_be_used(content, message, tmp_path):
     path = tmp_path / "map.npy"

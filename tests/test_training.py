@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import copy
 import dataclasses
+import errno
 import functools
 import json
 import math
@@ -11,13 +12,12 @@ import multiprocessing
 import os
 import random
 import re
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
-from stubs import in_this_process
+from stubs import in_this_process, no_file_larger_than
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train_high
@@ -220,18 +220,18 @@ def test_a_checkpoint_of_another_network(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_checkpoint_of_another_number_of_robots() -> None:
+    model = learner(seed=0)
+    memory = {
+        name: th.zeros(1, 100, 8) for name in ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
+    }
+    taken = Checkpoint.take(model, {})
+    taken = dataclasses.replace(taken, tensors=taken.tensors | memory)
+    with pytest.raises(CheckpointError, match=r"^the checkpoint is of 100 robots, not 1$"):
+        taken.restore(model)
+
+
 # ------------------------------------------------------------------ a full disk
-
-
-@contextlib.contextmanager
-def no_file_larger_than(size: int) -> Iterator[None]:
-    """Make writes beyond ``size`` bytes of a file fail, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_checkpoint_that_finds_no_room_leaves_those_before(tmp_path: Path) -> None:
@@ -564,7 +564,21 @@ def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     assert train_high.main(["--resume", "--out", str(broken), "--set", "start_speed=0.3"]) == 2
     assert "keeps the run's start_speed, 0.5: no other start_speed" in capsys.readouterr().err
     assert (broken / "config.json").read_text(encoding="utf-8") == config
+    # A full disk at the end of imitation stops the run, which would not write that policy later.
+    save = policies.save
+
+    def no_room(path: Path, *rest: Any) -> None:
+        if path.name == "imitation":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(path, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(policies, "save", no_room)
+        assert train_high.main(["--resume", "--out", str(broken)]) == 1
+    assert "No space left on device" in capsys.readouterr().err
+    assert Checkpoint.read(newest(broken)).steps < 16
     kill_run("train_high.py", ["--resume", "--out", str(broken)], last)
+    assert (broken / "imitation.json").is_file()
     cut = Checkpoint.read(newest(broken))
     assert cut.steps < 40
     (state,) = cut.workers()
@@ -665,6 +679,11 @@ def test_robots_that_fall_too_often_to_be_calibrated(
     assert capsys.readouterr().err.endswith(f"train_low.py: {said}; {hint}\n")
     assert train_low.main(["--resume", "--set", "calibration.robots=0", *out]) == 0
     assert policies.load(tmp_path / "policy").meta["calibration"] == {"robots": 0}
+    # From now on this is how the run ends.
+    before = weights(tmp_path)
+    assert train_low.main(["--resume", *out]) == 0 and weights(tmp_path) == before
+    kept = json.loads((tmp_path / "config.json").read_text(encoding="utf-8"))
+    assert kept["calibration"] == {"robots": 0}
 
 
 @pytest.mark.usefixtures("inline_workers")
@@ -717,6 +736,8 @@ def test_calibration_ends_a_run_of_the_low_policy(
     assert train_low.main([*resumed, "--out", str(later)]) == 0
     assert weights(later) == weights(whole)
     assert "calibration" not in policies.load(later / "uncalibrated").meta
+    assert train_low.main(["--resume", "--out", str(later)]) == 0  # as it is
+    assert weights(later) == weights(whole)
     again = ["--resume", "--set", "calibration.robots=65", "--out", str(later)]
     assert train_low.main(again) == 2
     said = "policy is already calibrated, with 'calibration.robots' 64, not 65; python -m"
@@ -832,6 +853,7 @@ def test_flags_and_folders_that_cannot_be_used(
             "env.command_seconds=0.005",
         ],
         "'plane_share' must be from 0 to below 1, not 1": ["--set", "plane_share=1"],
+        "below which a robot has fallen, not 0.14": ["--set", "env.robot.base_height=0.17"],
         "'calibration.robots' must be 0 or at least 64": ["--set", "calibration.robots=63"],
         "--worker-timeout must be above 0 and at most 86400, not inf": ["--worker-timeout", "inf"],
         "--time-limit must be at least 0 s, not nan": ["--time-limit", "nan"],
@@ -877,7 +899,8 @@ def test_flags_and_folders_that_cannot_be_used(
             "'ppo.minibatches' cannot be 97 with 100 robots of 24 steps; 100 can",
         ),
         ("ppo.initial_std=0", "'ppo.initial_std' must be above 0, not 0"),
-        ("seed=-1", "'seed' must be at least 0, not -1"),
+        ("seed=-1", "'seed' must be from 0 to 2**32 - 1, not -1"),
+        ("seed=4294967296", "'seed' must be from 0 to 2**32 - 1, not 4294967296"),
         ("steps=0", "'steps' must be at least 1, not 0"),
         ("ppo.ent_coef=0", "'ppo.imitation_coef' needs 'ppo.ent_coef' above 0; or set it to 0"),
         ("env.unknown_share=1.5", "'env.unknown_share' must be from 0 to 1, not 1.5"),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tdgc.benchmark.memory import Obstacles, Profile, Reckoning
 from tdgc.config import HighLevelConfig, LowLevelConfig
 from tdgc.sim.commands import INDEX, CommandDecoder, default_command
-from tdgc.sim.gaits import raw_phase
+from tdgc.sim.gaits import GAITS, gait_embedding, raw_phase
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.tile import GOAL_X, ZONE
@@ -58,6 +58,7 @@ class Memory:
         unknown: (M,) whether the cue reports the family as unknown.
         slope: (M,) rad, slope of the ground across the heading; positive if it rises to the left.
         x: (2, M) m, position along the tile on both tracks at the previous decision.
+        clock, leapt: (M,) gait clock at the previous decision, and cycles since a leap began.
         plan: the plan of landings.
         planned: the lips (k, 2) m that each robot's plan was made for.
         command: (M, 15) commands of the last decision.
@@ -74,6 +75,7 @@ class Memory:
         self.unknown = np.array([name == "unknown" for name in told])
         self.slope = np.zeros(m)
         self.x = self.where.position[..., 0]
+        self.clock, self.leapt = np.zeros(m), np.zeros(m)
         self.plan = plan
         self.planned = [np.full((1, 2), np.nan)] * m
         self.command = np.tile(default_command(), (m, 1))
@@ -89,7 +91,7 @@ class CuesLaw:
     """
 
     def __init__(self, low: LowLevelConfig, skill: Skill, config: HighLevelConfig) -> None:
-        self._landing, self._ranges = skill.landing, low.commands
+        self._landing, self._ranges, self._robot = skill.landing, low.commands, low.robot
         self._leap_speed = skill.manner.leap_speed
         self._styles = {  # how to walk on each family with this low policy
             "rough": skill.uneven,
@@ -114,7 +116,7 @@ class CuesLaw:
         bearing = np.arctan2(cue["goal"][:, 2], cue["goal"][:, 1])
         if state is None:
             told = [SEMANTIC[k] for k in cue["family"].argmax(axis=1)]
-            plan = LeapPlan(len(told), self._ranges, _CLEAR, self._leap_speed)
+            plan = LeapPlan(len(told), self._ranges, self._robot, _CLEAR, self._leap_speed)
             state = Memory(plan, told, distance, bearing)
         else:
             velocity = state.command[:, [INDEX["vx"], INDEX["vy"]]]
@@ -185,6 +187,12 @@ class CuesLaw:
         heading, x = memory.where.heading[chosen], along[chosen]
         # Use the mean heading of the two tracks until they can be told apart.
         heading = np.where(track < 0, memory.where.heading.mean(axis=0), heading)
+        # In trot and pronk the right front foot's raw phase is the gait clock.
+        phase = np.arctan2(cue["clock"][:, 1], cue["clock_cosine"][:, 1])
+        clock = raw_phase(np.mod(phase / (2.0 * np.pi), 1.0), before[:, INDEX["duration"]])
+        went, memory.clock = np.mod(clock - memory.clock, 1.0), clock
+        leapt = (before[:, 12:] == gait_embedding(GAITS.index("pronk"))).all(axis=1)
+        memory.leapt = np.where(leapt, memory.leapt + went, 0.0)
         leaping = []
         for i in np.flatnonzero(memory.gap).tolist():
             lips = memory.profile.trenches(i, tracks[i], _WIDEST)
@@ -200,11 +208,9 @@ class CuesLaw:
             leaps = memory.command[rows]
             ways = heading[rows] + bearing[rows], heading[rows]
             steer_leap(leaps, *ways, self._ranges, self._leap_speed)
-            # In trot and pronk the right front foot's raw phase is the gait clock.
-            phase = np.arctan2(cue["clock"][rows, 1], cue["clock_cosine"][rows, 1])
-            clock = raw_phase(np.mod(phase / (2.0 * np.pi), 1.0), before[rows, INDEX["duration"]])
             commanded = np.full(len(rows), min(self._leap_speed, self._ranges.vx[1]))
             stride = before[rows][:, STRIDE_COMMANDS].T
-            motion = Motion(x[rows], speed[rows], commanded, clock, *stride)
+            cycles = memory.leapt[rows]
+            motion = Motion(x[rows], speed[rows], commanded, clock[rows], cycles, *stride)
             leap_command(leaps, *memory.plan.steps(rows, motion, landing), self._ranges)
             memory.command[rows] = leaps

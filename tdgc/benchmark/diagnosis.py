@@ -150,17 +150,17 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
     if tile is not None and trace.outcome != "left_tile":
         away = to_trenches(tile, trace["base_x"][-1]).min(initial=np.inf)
         at_trench = bool(away < hips + REACH)
-    errors = tracking_errors(trace, intervals & free(trace, tile, hips))
-    limits = {
-        name: limit.episode if trace.outcome == "timeout" else limit.stretch
-        for name, limit in LIMITS.items()
-    }
+    tracked = intervals & free(trace, tile, hips)
+    errors = tracking_errors(trace, tracked)
+    # Means over a shorter time vary more, so they have the higher limits.
+    whole = trace.outcome == "timeout" and trace["seconds"][1:][tracked].sum() > LOOK_BACK
+    limits = {name: limit.episode if whole else limit.stretch for name, limit in LIMITS.items()}
     lost = [name for name, error in errors.items() if error > limits[name]]
     towards = asked_towards(trace, intervals)
     # Without a tile, the outcome is reported rather than measured: "collided" then means that the
     # robot did not hit the ground.
     tripped = trace.outcome == "collided" and tile is not None and not held[-1]
-    down = trace.outcome == "fell" or tripped
+    down = (trace.outcome == "fell" and not held[-1]) or tripped
     obstacle = "an obstacle" if tile is None else _obstacle(tile.family)
     if trace.family == "mixed" or trace.level > MAX_LEVEL:
         blamed = "terrain", "never trained on"
@@ -174,7 +174,7 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
         blamed = "execution", "lost its footing on the way to the goal"
     elif down:
         blamed = "decisions", "lost its footing on the way elsewhere"
-    elif trace.outcome == "collided":
+    elif trace.outcome in ("fell", "collided"):
         blamed = "decisions", f"steered into {obstacle}"
     elif trace.outcome == "left_tile":
         blamed = "decisions", "steered off the tile"

@@ -24,7 +24,7 @@ from tdgc.sim.observation import width
 from tdgc.sim.robot import Array, to_goal, wrap_angle
 from tdgc.sim.sensors import Noise
 from tdgc.tasks.high_observation import SEMANTIC, HighObserver, high_layout, semantic_index
-from tdgc.tasks.pairing import paired
+from tdgc.tasks.pairing import MisfitError, paired
 from tdgc.tasks.rules import episode_steps
 from tdgc.tasks.teacher import Skill, Teacher, toward
 
@@ -118,7 +118,7 @@ class TeacherDriver(Driver):
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:
         self._loco, self._goal = loco, goal
         assert loco.world.field is not None  # episodes run on tiles
-        self._teacher = Teacher(loco.world.field, self.bounds, self._skill)
+        self._teacher = Teacher(loco.world.field, self.bounds, loco.robot, self._skill)
         self._teacher.begin(np.arange(loco.num_robots), goal)
 
     def command(self, step: int) -> Array:
@@ -199,9 +199,9 @@ def load_high(
     """Load a high policy and the MDP it was trained on, for use with the low policy ``low``.
 
     Raises:
-        ValueError: the file cannot be used, is not a high policy, or was trained on a low policy
-            with another robot, observation or control rate, or with commands that ``low`` was not
-            trained on; the message names the mismatch.
+        MisfitError: it was trained on a low policy with another robot, observation or control
+            rate, or with commands that ``low`` was not trained on; the message names the mismatch.
+        ValueError: the file cannot be used or is not a high policy.
     """
     high = policies.load(path)
     if high.action_dim != NUM_ACTIONS:
@@ -215,7 +215,7 @@ def load_high(
     for field in fields(RobotConfig):
         wanted, given = (getattr(c.robot, field.name) for c in (trained_on, low_config))
         if wanted != given:
-            raise ConfigError(
+            raise MisfitError(
                 f"{path}: trained for a low policy with robot.{field.name} {wanted}, not {given}"
             )
     for what, wanted, given in (
@@ -228,5 +228,5 @@ def load_high(
         ),
     ):
         if wanted != given:
-            raise ConfigError(f"{path}: trained for {what.format(wanted)}, not {given}")
+            raise MisfitError(f"{path}: trained for {what.format(wanted)}, not {given}")
     return high, paired(config, low_config)

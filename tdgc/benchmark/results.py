@@ -183,13 +183,14 @@ def editions_of(metas: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
 
 
 def robot_changes(mdp: LowLevelConfig) -> list[str]:
-    """List what a low policy's ``mdp`` has in place of the benchmark's robot, motors and physics,
-    such as ``robot.kp=18.6, not 20.0``."""
+    """List what a low policy's ``mdp`` has in place of the benchmark's robot, motors and control
+    step, such as ``robot.kp=18.6, not 20.0``. All else in its physics is replaced."""
     mine, usual = to_dict(mdp), to_dict(LowLevelConfig())
     robot = {name: mine["robot"][name] for name in _PRESCRIBED}
+    step = {"control_dt": mine["physics"]["control_dt"]}
     return [
         *differences(robot, usual["robot"], "robot"),
-        *differences(mine["physics"], usual["physics"], "physics"),
+        *differences(step, usual["physics"], "physics"),
     ]
 
 

@@ -31,6 +31,7 @@ Positive = Annotated[float, Rule("above 0", lambda x: x > 0.0)]
 NotNegative = Annotated[float, Rule("at least 0", lambda x: x >= 0.0)]
 Weight = Annotated[float, Rule("from -100 to 100", lambda x: -100.0 <= x <= 100.0)]
 Whole = Annotated[int, Rule("at least 0", lambda x: x >= 0)]
+Seed = Annotated[int, Rule("from 0 to 2**32 - 1", lambda x: 0 <= x < 2**32)]  # as NumPy's
 Count = Annotated[int, Rule("at least 1", lambda x: x >= 1)]
 Range = Annotated[tuple[float, float], Rule("[low, high] with low <= high", lambda b: b[0] <= b[1])]
 PositiveRange = Annotated[

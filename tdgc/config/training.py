@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 
 from tdgc.config.high import HighLevelConfig
 from tdgc.config.low import LowLevelConfig
-from tdgc.config.settings import Count, NotNegative, Positive, Share, Whole
+from tdgc.config.settings import Count, NotNegative, Positive, Seed, Share, Whole
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class CalibrationConfig:
 class LowTrainConfig:
     """A run of train_low.py: robots on a plane and on terrain, then calibration."""
 
-    seed: Whole = 42  # the paper's
+    seed: Seed = 42  # the paper's
     n_envs: Count = 120
     workers: Count = 2
     steps: Count = 36_000_000  # control steps of reinforcement learning, over all robots
@@ -170,7 +170,7 @@ class ImitationConfig:
 class HighTrainConfig:
     """A run of train_high.py."""
 
-    seed: Whole = 42
+    seed: Seed = 42
     n_envs: Count = 100
     workers: Count = 2
     steps: Count = 2_100_000  # decisions over all robots: 80 minutes to 3 hours on two cores

@@ -41,7 +41,8 @@ DECIDED = ("family", "probes", "probe_age", "decision")
 #: in rad in the map frame of the goal. With neither, velocity and yaw rate are unknown; a
 #: heading from the gyro alone drifts.
 OPTIONAL = {"gyro": 3, "yaw": 1}
-ENDS = ("reached", "fell", "collided", "timeout")  # of an episode without a tile
+# Of an episode; only a simulator's log ends in ``left_tile``.
+ENDS = ("reached", "fell", "collided", "left_tile", "timeout")
 _SAME = 5e-3  # in the value's own unit: logs with four decimals differ by up to 3e-3, in leaps
 # Share of a step: at 50 Hz the millisecond to which a program may round its time stamps.
 _PUNCTUAL = 0.05
@@ -348,7 +349,7 @@ def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
             "reached" but the log never reaches the goal, or "timeout" but it does, or ends before
             the horizon.
     """
-    if told in ("fell", "collided"):
+    if told in ENDS[1:4]:
         return told
     goals, task = log.values["goal"], controller.high.table["task"]
     distance = np.linalg.norm(goals, axis=1)
@@ -380,10 +381,15 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
         told: how the episode ended, if the log does not show it.
 
     Raises:
-        LogError: see ``outcome``.
+        LogError: see ``outcome``; or the robot fell long after its last decision.
     """
     seen, begin = log.values, log.decisions
     end = np.minimum(begin + controller.decimation, len(log.time) - 1)
+    if told in ENDS[1:4] and end[-1] < len(log.time) - 1:
+        raise LogError(
+            f"{log.name}: no decision after {log.time[begin[-1]]:.2f} s led to what happened at "
+            f"{log.time[-1]:.2f} s: it was no longer part of the episode"
+        )
     rows = np.append(begin, end[-1])
     columns: dict[str, NDArray[Any]] = {
         c.name: np.full(len(rows), np.nan if c.unit else None, np.float32 if c.unit else object)

@@ -30,7 +30,7 @@ from tdgc.files import write_synced
 from tdgc.state import State, join, split
 
 _KEEP = 2  # checkpoints: the newest, and the one before in case that is damaged
-_VERSION = 16  # to be raised when the state of a run changes: other versions are refused
+_VERSION = 17  # to be raised when the state of a run changes: other versions are refused
 #: Tensor names of the recurrent learner's LSTM states in the current episodes.
 _LSTM = ("lstm.pi.h", "lstm.pi.c", "lstm.vf.h", "lstm.vf.c")
 
@@ -171,7 +171,7 @@ class Checkpoint:
         This covers parameters, optimiser, counters, LSTM states and the notebook of rollouts.
 
         Raises:
-            CheckpointError: parameters with different names or shapes.
+            CheckpointError: parameters with different names or shapes, or another number of robots.
         """
         tensors = self.tensors
         try:
@@ -193,10 +193,15 @@ class Checkpoint:
                 f"the checkpoint does not fit the configuration: {said}"
             ) from error
         if _LSTM[0] in tensors:
+            robots = tensors[_LSTM[0]].shape[1]
+            if robots != model.n_envs:
+                raise CheckpointError(f"the checkpoint is of {robots} robots, not {model.n_envs}")
             h_pi, c_pi, h_vf, c_vf = (tensors[name].to(model.device) for name in _LSTM)
             cast(Any, model)._last_lstm_states = RNNStates(pi=(h_pi, c_pi), vf=(h_vf, c_vf))
         model.num_timesteps = self.steps
         model._n_updates = int(self.header["n_updates"])
+        # Generators of a GPU are not saved: give it other noise than at the start of the run.
+        th.manual_seed(int(model.seed or 0) + self.steps)
         _restore_random(tensors, self.header["random"])
 
     def workers(self) -> list[State]:

@@ -151,6 +151,8 @@ class Run:
                 raise unsaved
             if finished:
                 finish()
+                # Even if nothing was left to train, these are the settings of the result now.
+                write_json(self.folder / "config.json", to_dict(self.config))
             else:
                 self.interruption.tell(self.folder)
 
@@ -213,6 +215,8 @@ class Run:
             # A phase's policy is kept beside those of later phases.
             keeps = finished and phase.until < self.config.steps
             taken = callback.save(("policy", phase.name) if keeps else ("policy",))
+            if keeps and callback.unsaved is not None:
+                raise callback.unsaved  # later phases would not write this phase's policy
             return taken, finished, callback.unsaved
         finally:
             env.close()
@@ -432,7 +436,8 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
     written then is complete.
 
     Raises:
-        WorkerError: too many worker faults; the learner is as it was after the last update.
+        WorkerError: too many worker faults; parameters and step count are those after the last
+            update.
     """
     callback.init_callback(model)
     callback.on_training_start(locals(), globals())

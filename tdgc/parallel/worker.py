@@ -379,7 +379,8 @@ class ProcessLink:
 
     def receive(self, timeout: float) -> Any:
         try:
-            if not self._pipe.poll(timeout):
+            # In two halves: if Ctrl-Z outlasts the first, the worker has the second to answer.
+            if not self._pipe.poll(timeout / 2) and not self._pipe.poll(timeout / 2):
                 raise WorkerError(f"worker {self._worker} gave no answer for {timeout:g} s")
             answer = self._pipe.recv()
         except (EOFError, OSError):

@@ -4,16 +4,16 @@ A policy on disk is two files side by side: ``NAME.safetensors`` holds the tenso
 critic, ``NAME.json`` describes them::
 
     {"format": "tdgc-policy", "version": 1,
-     "kind": "mlp",                                   "mlp" (Sec. IV-A) or "lstm" (Sec. IV-B)
+     "kind": "lstm",                                  "mlp" (Sec. IV-A) or "lstm" (Sec. IV-B)
      "architecture": {"activation": "elu",            elu, relu or tanh, after each hidden layer
-                      "actor": [256, 192],            hidden sizes
-                      "critic": [256, 128],
-                      "lstm": null,                   hidden size of both LSTMs; null for "mlp"
+                      "actor": [64],                  hidden sizes
+                      "critic": [64],
+                      "lstm": 64,                     hidden size of both LSTMs; null for "mlp"
                       "encoder": [128],               layer sizes before both LSTMs; omitted if none
                       "correction": [15, 64, 3]},     layer sizes, see Correction; omitted if none
-     "observation": {"size": 130, "actor_size": 90},  [actor part | critic-only part]
+     "observation": {"size": 92, "actor_size": 92},   [actor part | critic-only part]
      "mirror": null,                                  or how left and right swap, see Mirror
-     "action": {"size": 12, "low": [...], "high": [...]},            null: unbounded
+     "action": {"size": 13, "low": [...], "high": [...]},            null: unbounded
      "sha256": "...",                                 of NAME.safetensors
      "meta": {...}}                                   the caller's: configuration, seed, steps, ...
 

@@ -55,6 +55,9 @@ FIGURES = (
 #: soon as there is a new one.
 DERIVED = (
     "traces/*.parquet",
+    "logs/*.npz",
+    "logs/.*.tmp",
+    "mujoco.json",
     "diagnosis.csv",
     "behaviour.csv",
     "tuning.json",

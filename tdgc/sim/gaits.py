@@ -103,6 +103,12 @@ def swing_profile(phases: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.sin(np.pi * swing)
 
 
+def begun(cycles: NDArray[np.floating], first: float) -> NDArray[np.float64]:
+    """Completed share of a gait's ``first`` cycles after ``cycles`` of any shape; 1 if ``first`` is
+    0."""
+    return np.minimum(cycles / first, 1.0) if first > 0.0 else np.ones_like(cycles)
+
+
 class PhaseClock:
     """One clock per robot, g <- (g + dt f) mod 1, and the four foot phases derived from it.
 
@@ -154,11 +160,7 @@ class PhaseClock:
         """cos(2 pi phase) of each foot, (M, 4): the sine alone takes each value twice per cycle."""
         return np.cos(2.0 * np.pi * self.phases)
 
-    def begun(self, cycles: float) -> NDArray[np.float64]:
-        """Completed share of a gait's first ``cycles``, (M,) in [0, 1]; 1 if ``cycles`` is 0."""
-        return np.minimum(self.cycles / cycles, 1.0) if cycles > 0.0 else np.ones_like(self.cycles)
-
     def swing(self, ramp: float) -> NDArray[np.float64]:
         """Height of each foot as a share of its apex, (M, 4), growing over a gait's first ``ramp``
         cycles: legs that are all drawn up before the trunk rises let it drop."""
-        return self.begun(ramp)[:, None] * swing_profile(self.phases)
+        return begun(self.cycles, ramp)[:, None] * swing_profile(self.phases)

@@ -24,7 +24,7 @@ from tdgc.config import (
 )
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, NAMES, SIDEWAYS, default_command, gait_index, observed_command
-from tdgc.sim.gaits import GAITS, PhaseClock, foot_phases
+from tdgc.sim.gaits import GAITS, PhaseClock, begun, foot_phases
 from tdgc.sim.geometry import Geometry
 from tdgc.sim.observation import (
     JOINT_FLIP,
@@ -148,10 +148,10 @@ class Locomotion:
         slows to the commanded frequency over ``start_cycles``. At 2 Hz pronk and bound have a
         flight phase of a quarter of a second, and a robot's first jump is too weak for that.
         """
-        begun, asked = self.clock.begun(self.robot.start_cycles), self.command[:, _FREQUENCY]
-        command = self.command.copy()
+        asked, command = self.command[:, _FREQUENCY], self.command.copy()
+        late = begun(self.clock.cycles, self.robot.start_cycles)
         least = min(self.robot.start_frequency, self.frequency_limit)
-        command[:, _FREQUENCY] += (1.0 - begun) * np.maximum(least - asked, 0)
+        command[:, _FREQUENCY] += (1.0 - late) * np.maximum(least - asked, 0)
         return command
 
     def followed(self) -> Array:
@@ -189,7 +189,7 @@ class Locomotion:
             )
             for time in (middle, middle + self.robot.kd / self.robot.kp)
         )
-        grown = self.clock.begun(self.robot.swing_ramp)
+        grown = begun(self.clock.cycles, self.robot.swing_ramp)
         return walking_pose(self.robot, geometry, command, phases, ahead, grown)
 
     def place(self, index: NDArray[np.integer], xy: Array, yaw: Array, clock: Array) -> None:

@@ -176,11 +176,12 @@ def walking_pose(
 ) -> Array:
     """q0(c, phi) of a robot that walks as commanded, (M, 12) rad.
 
-    The feet are under a trunk at the commanded height, pitch and roll, as far apart as in
-    ``commanded_pose``. They move between Raibert's footholds and rise to the commanded height in
-    swing. On top of that, the joints are offset by the position error that the joint control needs
-    to carry the load of the stance feet (``stance_load``). The pose is the offset of the actions,
-    not a constraint, see ``commanded_pose``.
+    The lowest feet are under a trunk at the commanded height, pitch and roll. The others stay as
+    much higher as in the nominal pose: the rear ones of the shipped robot 9 mm. The feet are as far
+    apart as in ``commanded_pose``, move between Raibert's footholds and rise to the commanded
+    height in swing. On top of that, the joints are offset by the position error that the joint
+    control needs to carry the load of the stance feet (``stance_load``). The pose is the offset of
+    the actions, not a constraint, see ``commanded_pose``.
 
     Args:
         config: the robot's settings.

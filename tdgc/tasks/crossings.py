@@ -75,7 +75,7 @@ class Crossings:
         self._low, self._high = command_bounds(config.commands).T
         self.flat = np.array([family == FLAT for family in families])
         self.leapers = np.zeros(len(families), dtype=bool)
-        self._plan = LeapPlan(len(families), config.commands, _CLEAR)
+        self._plan = LeapPlan(len(families), config.commands, config.robot, _CLEAR)
         self.landing = Landing()
         self.spread = np.zeros(len(families))
 

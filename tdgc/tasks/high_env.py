@@ -14,6 +14,7 @@ from tdgc.config import HighLevelConfig
 from tdgc.policies import Policy
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import NUM_ACTIONS, CommandDecoder, default_command, gait_index
+from tdgc.sim.families import MAX_LEVEL
 from tdgc.sim.gaits import GAITS
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
@@ -103,7 +104,7 @@ class NavigationTask:
         self.teacher = None
         if taught is not None:
             assert config.commands is not None  # ``paired`` has set them
-            self.teacher = Teacher(self.field, config.commands, taught)
+            self.teacher = Teacher(self.field, config.commands, self.low_config.robot, taught)
         self._lead, self._decisions = led, np.zeros(1, dtype=np.int64)
         self._led = np.zeros(m, dtype=bool)
         self._taught = np.zeros((m, NUM_ACTIONS))
@@ -151,8 +152,8 @@ class NavigationTask:
             self._led[index] = rng.uniform(size=n) < share
 
     def _width(self) -> Array:
-        """Scale of each robot's disturbances, (M,), growing with its level from 0 to 1."""
-        return self.curriculum.levels / max(self.config.levels - 1, 1)
+        """Scale of each robot's disturbances, (M,), 0 on level 0 and 1 on ``MAX_LEVEL``."""
+        return self.curriculum.levels / MAX_LEVEL
 
     def restart(self) -> None:
         """End every episode, draw new tiles and rebuild the world from scratch."""

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tdgc.config import CommandRanges, LowLevelConfig
+from tdgc.config import CommandRanges, LowLevelConfig, RobotConfig
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX
-from tdgc.sim.gaits import GAITS, gait_embedding
+from tdgc.sim.gaits import GAITS, begun, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.tile import TILE_SIZE
@@ -66,6 +66,7 @@ FREQUENCIES, LENGTHS = 25, 11
 # from rest, and 1.14 m/s in the long run when 1.2 is commanded. Without this model, landings at a
 # trench right behind the start were misjudged by 7 cm.
 _RISE, _REACHED = 0.3, 0.95  # time constant in s; share of the commanded speed that is reached
+_PRONK = gait_embedding(GAITS.index("pronk"))
 # Choices about as good as the best are averaged: the price that reduces a choice's weight by a
 # factor of e, and how many Hz and m it may be from the best, so that a short leap is never averaged
 # with a long one.
@@ -110,14 +111,14 @@ class Landing:
 
         Args:
             loco: robots that leap along x.
-            rows: robots to be looked at.
+            rows: robots to be looked at; in a gait's first cycle none has leapt yet.
             before: (n,) their clocks a control step ago.
             rate: weight of one landing in the estimate.
         """
         state = loco.world.state
         clock = loco.clock.clock[rows]
         middle = 0.2  # of a cycle: the middle of the shortest stance, 0.4, when all feet are down
-        landed = (before < middle) & (clock >= middle)
+        landed = (before < middle) & (clock >= middle) & (loco.clock.cycles[rows] >= 1.0)
         seen = rows[landed]
         if seen.size:
             feet = state.foot_position[seen, :, 0]
@@ -154,6 +155,7 @@ class Motion(NamedTuple):
         x: m, position of the trunk on the axis that the lips of the trenches are given on.
         speed, commanded: m/s, forward speed and its command.
         clock: gait clock, 0 when the feet touch down.
+        cycles: of the clock since the leap began, 0 before it.
         frequency, length: step frequency in Hz and stance length in m, as last commanded.
     """
 
@@ -161,6 +163,7 @@ class Motion(NamedTuple):
     speed: Array
     commanded: Array
     clock: Array
+    cycles: Array
     frequency: Array
     length: Array
 
@@ -170,7 +173,10 @@ class Motion(NamedTuple):
     ) -> "Motion":
         """The motion of the robots ``rows`` (n,), with their own clocks and strides."""
         frequency, length = loco.command[rows][:, STRIDE_COMMANDS].T
-        return cls(x, speed, commanded, loco.clock.clock[rows], frequency, length)
+        clock = loco.clock
+        leaps = (clock.embedding[rows] == _PRONK).all(axis=1)
+        cycles = np.where(leaps, clock.cycles[rows], 0.0)
+        return cls(x, speed, commanded, clock.clock[rows], cycles, frequency, length)
 
 
 class Lesson(NamedTuple):
@@ -198,15 +204,21 @@ class LeapPlan:
     Args:
         num_robots: M.
         ranges: command ranges of the leaps.
+        robot: whose first steps in a gait may be faster than commanded.
         clear: m from a lip, beyond which a foot is safe.
         speed: m/s, commanded.
     """
 
     def __init__(
-        self, num_robots: int, ranges: CommandRanges, clear: float = CLEAR, speed: float = SPEED
+        self,
+        num_robots: int,
+        ranges: CommandRanges,
+        robot: RobotConfig,
+        clear: float = CLEAR,
+        speed: float = SPEED,
     ) -> None:
         low, high = ranges.stance_length
-        self._clear = clear
+        self._clear, self._robot = clear, robot
         self._speed = min(speed, ranges.vx[1])
         self._lengths = np.linspace(low, high, LENGTHS)
         self._frequencies = np.linspace(*ranges.frequency, FREQUENCIES)
@@ -272,13 +284,28 @@ class LeapPlan:
         frequency, length = np.divmod(best, len(self._lengths))
         return frequency, length
 
+    def _touchdown(self, motion: Motion) -> tuple[Array, Array]:
+        """Time in s to the next landing with each frequency, and the frequency that is carried out
+        then, (n, frequencies) each; see ``Locomotion.executed``."""
+        asked, robot = self._frequencies, self._robot
+        to_go = 1.0 - motion.clock
+        hurry = np.maximum(robot.start_frequency - asked, 0.0)
+        now, then = (
+            asked + hurry * (1.0 - begun(cycles, robot.start_cycles))[:, None]
+            for cycles in (motion.cycles, motion.cycles + to_go)
+        )
+        hurried = np.clip(robot.start_cycles - motion.cycles, 0.0, to_go)
+        # It falls in proportion to the cycles, so the mean is right to within 1 % of a cycle.
+        time = hurried[:, None] / (0.5 * (now + then)) + (to_go - hurried)[:, None] / asked
+        return time, then
+
     def _costs(self, rows: NDArray[np.integer], motion: Motion, landing: Landing) -> Array:
         """Cost of each frequency with each stance length, (n, frequencies, lengths)."""
         stride = np.maximum(motion.speed, self._speed)[:, None] / self._frequencies
-        left = (1.0 - motion.clock)[:, None] / self._frequencies
+        left, frequency = self._touchdown(motion)
         own = np.maximum(motion.speed, 0.0)[:, None]
         way, then = speed_up(own, motion.commanded[:, None], left)
-        foothold = motion.x[:, None] + way + lead(then, self._frequencies) + landing.front
+        foothold = motion.x[:, None] + way + lead(then, frequency) + landing.front
         place = np.round((foothold[:, :, None] + 0.5 * self._lengths) / _STEP).astype(int)
         place = np.clip(place, 0, len(self._x) - 1)
         cost = self._cost[rows[:, None, None], place, np.arange(len(self._lengths))]

@@ -98,15 +98,19 @@ def orientation(s: LowStep) -> Array:
     return square_sum((s.state.gravity - wanted)[:, :2])
 
 
-def raibert_targets(command: Array, phases: Array, stance: tuple[float, float]) -> Array:
+def raibert_targets(
+    command: Array, phases: Array, stance: tuple[float, float], centre: float
+) -> Array:
     """Footholds of Raibert's rule in the heading frame: (M, 15), (M, 4) -> (M, 4, 2) m.
 
-    They are the corners of the commanded stance rectangle, shifted by ``robot.foot_travel``. Its
-    length and width differ from ``stance`` (2,) m, those of the robot at the default commands, as
-    the commands do from their defaults.
+    They are the corners of the commanded stance rectangle, whose middle is ``centre`` m ahead of
+    the trunk's, as that of the hips is, shifted by ``robot.foot_travel``. Its length and width
+    differ from ``stance`` (2,) m, those of the robot at the default commands, as the commands do
+    from their defaults.
     """
     rectangle = command[:, _STANCE] + (np.array(stance) - default_command()[_STANCE])
     rest = 0.5 * rectangle[:, None, :] * np.stack([FRONT, SIDE], axis=1)
+    rest[..., 0] += centre
     return rest + foot_travel(command, phases, rest)
 
 
@@ -115,7 +119,8 @@ def raibert_foothold(s: LowStep) -> Array:
     arm = s.state.foot_position[..., :2] - s.state.position[:, None, :2]
     c, d = np.cos(s.state.yaw)[:, None], np.sin(s.state.yaw)[:, None]
     feet = np.stack([c * arm[..., 0] + d * arm[..., 1], c * arm[..., 1] - d * arm[..., 0]], axis=-1)
-    error = feet - raibert_targets(s.command, s.phases, s.stance)
+    centre = float(s.state.geometry.hips[:, 0].mean())
+    error = feet - raibert_targets(s.command, s.phases, s.stance, centre)
     return np.einsum("mfi,mfi->m", error, error)
 
 
@@ -182,7 +187,7 @@ def tilt_rate(s: LowStep) -> Array:
 
 
 def nodding(s: LowStep) -> Array:
-    """Squared change, within one gait cycle, of the xy of unit gravity in the trunk's frame."""
+    """Squared change, over one gait cycle, of the xy of unit gravity in the trunk's frame."""
     return square_sum(s.state.gravity[:, :2] - s.last_tilt)
 
 

@@ -20,11 +20,15 @@ from tdgc.sim.robot import NUM_JOINTS
 PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
 
 
+class MisfitError(ConfigError):
+    """A high policy that does not fit the low policy; the message names the mismatch."""
+
+
 def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
     """The high policy's MDP with the decoder's bounds filled in: the low policy's, if it sets none.
 
     Raises:
-        ConfigError: bounds that the low policy was not trained on; names the command and both
+        MisfitError: bounds that the low policy was not trained on; names the command and both
             ranges.
     """
     ranges = high.commands or low.commands
@@ -37,7 +41,7 @@ def paired(high: HighLevelConfig, low: LowLevelConfig) -> HighLevelConfig:
     for f in dataclasses.fields(low.commands):
         asked, trained = getattr(ranges, f.name), getattr(low.commands, f.name)
         if asked[0] < trained[0] or asked[1] > trained[1]:
-            raise ConfigError(
+            raise MisfitError(
                 f"commands.{f.name} asks for {list(asked)}, but the low policy was trained on "
                 f"{list(trained)}"
             )

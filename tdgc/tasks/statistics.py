@@ -70,10 +70,11 @@ def summarise_low(sums: Mapping[str, float]) -> dict[str, float]:
             if count:  # with few robots, none may be on tiles of the family
                 values[f"level/{family}"] = value / count
     for gait in GAITS:
-        n = max(sums.get(f"gait/{gait}/steps", 0.0), 1.0)
-        values[f"tracking/{gait}_velocity_rmse"] = (sums.get(f"gait/{gait}/lin", 0.0) / n) ** 0.5
-        values[f"tracking/{gait}_yaw_rate_rmse"] = (sums.get(f"gait/{gait}/yaw", 0.0) / n) ** 0.5
-        values[f"tracking/{gait}_contact_match"] = sums.get(f"gait/{gait}/match", 0.0) / n
+        n = sums.get(f"gait/{gait}/steps")
+        if n:  # no robot may have been commanded to walk in this gait
+            values[f"tracking/{gait}_velocity_rmse"] = (sums[f"gait/{gait}/lin"] / n) ** 0.5
+            values[f"tracking/{gait}_yaw_rate_rmse"] = (sums[f"gait/{gait}/yaw"] / n) ** 0.5
+            values[f"tracking/{gait}_contact_match"] = sums[f"gait/{gait}/match"] / n
     return values
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tdgc.config import CommandRanges, TeacherConfig
+from tdgc.config import CommandRanges, RobotConfig, TeacherConfig
 from tdgc.sim.commands import INDEX, VELOCITIES, CommandDecoder, default_command
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array, to_goal, wrap_angle
@@ -154,6 +154,7 @@ class Teacher:
     Args:
         field: M tiles.
         ranges: of the commands that it may give.
+        robot: whose first steps in a gait may be faster than commanded.
         skill: of the low policy.
 
     Attributes:
@@ -167,7 +168,9 @@ class Teacher:
             obstacles.
     """
 
-    def __init__(self, field: TileField, ranges: CommandRanges, skill: Skill) -> None:
+    def __init__(
+        self, field: TileField, ranges: CommandRanges, robot: RobotConfig, skill: Skill
+    ) -> None:
         m = field.count
         self._field, self._ranges, self._landing = field, ranges, skill.landing
         self._origin = field.origin(np.arange(m))
@@ -182,7 +185,7 @@ class Teacher:
         self._costs: dict[int, Array] = {}  # of travelling, on tiles with obstacles
         self._walk_speed, self._wanted_speed = skill.manner.walk_speed, skill.manner.leap_speed
         self._careful = skill.among_obstacles.speed
-        self._plan = LeapPlan(m, ranges, speed=self._wanted_speed)
+        self._plan = LeapPlan(m, ranges, robot, speed=self._wanted_speed)
         self._leap_speed = min(self._wanted_speed, ranges.vx[1])
         self._start = np.full(m, np.inf)  # m, x where a robot starts to leap
         self._end = np.full(m, -np.inf)  # m, x where a robot stops leaping
@@ -211,7 +214,9 @@ class Teacher:
 
     def watch(self, loco: Locomotion, seconds: float) -> None:
         """Update the speed estimates; to be called once per decision of ``seconds``."""
-        _, self.speed = speed_up(self.speed, self._leap_speed, seconds)
+        leaps = self._leaping(loco.world.state.position[:, 0] - self._origin[:, 0])
+        _, faster = speed_up(self.speed, self._leap_speed, seconds)
+        self.speed = np.where(leaps, faster, self.speed)
         seen = 1.0 - 0.5 ** (seconds / _HALF_LIFE)
         self.speed += seen * (loco.world.state.heading_vel[:, 0] - self.speed)
 
@@ -238,7 +243,7 @@ class Teacher:
         for way, toward_bearing in ((command, bearing), (self.other, second)):
             way[:, WAY] = self._walk(state.yaw, distance, toward_bearing, top_speed, detour, climb)
         self.price[:] = 0.0
-        rows = np.flatnonzero((local[:, 0] >= self._start) & (local[:, 0] < self._end))
+        rows = np.flatnonzero(self._leaping(local[:, 0]))
         if rows.size and self._landing is not None:
             leaps = np.tile(self._leap, (len(rows), 1))
             ways = bearing[rows], state.yaw[rows]
@@ -250,6 +255,10 @@ class Teacher:
             command[rows], self.price[rows] = leaps, lesson.price
             self.other[rows], self.dearer[rows] = leaps, 0.0
         return command
+
+    def _leaping(self, x: Array) -> NDArray[np.bool_]:
+        """Robots that leap at (M,) m along their tiles, (M,)."""
+        return (x >= self._start) & (x < self._end)
 
     def _slope_at(self, local: Array) -> Array:
         """Tangents of the slopes at (M, 2) m in the tiles' frames, (M,)."""
