@@ -146,7 +146,9 @@ RUNS: dict[str, Run] = {
         f"--levels 5 --policies gp {ONE} {CLUMSY}", ("runs/evaluation/trajectories.png",)
     ),
     """python train_high.py --low tdgc/pretrained/low --set 'env.families=["yard.npy"]' """
-    "--steps 600000 --set imitation.steps=160000 --out runs/yard": Run(HIGH, ("runs/yard/policy.safetensors",)),
+    "--steps 600000 --set imitation.steps=160000 --out runs/yard": Run(
+        HIGH, ("runs/yard/policy.safetensors",)
+    ),
     "python evaluate.py --high runs/yard/policy --families yard.npy --policies tdgc,gp,teacher "
     "--episodes 20": Run(f"--levels 5 {ONE} {CLUMSY}", ("runs/evaluation/summary.json",)),
     "python evaluate.py --families ripples.npy,cobbles.npy,logs.npy,terraces.npy,dome.npy,"
