@@ -14,6 +14,7 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch as th
 from stable_baselines3 import PPO
@@ -26,17 +27,18 @@ from tdgc.config import (
     LowLevelConfig,
     LowTrainConfig,
     RobotConfig,
+    read_json,
     to_dict,
     with_overrides,
 )
 from tdgc.errors import StoppedError, script
-from tdgc.files import make_folder
+from tdgc.files import make_folder, write_json
 from tdgc.learn.flags import Machine, add_arguments, configure
 from tdgc.learn.ppo import NoiseScaledRate, check_batch, shared_keywords
 from tdgc.learn.run import Interruption, Phase, Run
 from tdgc.parallel.cores import usable_cores
 from tdgc.parallel.vec import TaskVecEnv
-from tdgc.policies import AsymmetricActorCriticPolicy
+from tdgc.policies import AsymmetricActorCriticPolicy, Correction, Policy
 from tdgc.show import plots
 from tdgc.sim.locomotion import actor_layout, check_robot
 from tdgc.sim.observation import width
@@ -144,10 +146,25 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
                 f"{out / 'uncalibrated'} does it again"
             )
         return
-    if not robots:
-        meta = {**learned.meta, "calibration": {"robots": 0}}
-        policies.save_copy(out / "policy", learned, meta)
-        return
+    correction: Correction | None = None
+    facts: dict[str, Any] = {"robots": 0}
+    if robots:
+        found = _calibrate(out, config, learned, interruption)
+        if found is None:
+            return
+        correction, facts = found
+        policies.save_copy(out / "uncalibrated", learned, learned.meta)
+    # A run that was trained before has the setting of then in its file.
+    table = read_json(out / "config.json")
+    write_json(out / "config.json", table | {"calibration": to_dict(config.calibration)})
+    meta = {**learned.meta, "calibration": facts}
+    policies.save_copy(out / "policy", learned, meta, correction)
+
+
+def _calibrate(
+    out: Path, config: LowTrainConfig, learned: Policy, interruption: Interruption
+) -> tuple[Correction, dict[str, Any]] | None:
+    """The correction of the policy ``learned`` and how good it is; None if interrupted."""
     with tqdm(desc="calibrating", total=100, bar_format="{desc}: {percentage:3.0f}%|{bar}|") as bar:
 
         def tick(share: float) -> None:
@@ -157,17 +174,14 @@ def finish(out: Path, config: LowTrainConfig, interruption: Interruption) -> Non
 
         try:
             workers = min(config.workers, usable_cores())  # here, also after a run on a cluster
-            correction, facts = calibrate(learned, robots, workers, config.seed, tick)
+            return calibrate(learned, config.calibration.robots, workers, config.seed, tick)
         except StoppedError:
             interruption.tell(out)
-            return
+            return None
         except ConfigError as error:
             raise ConfigError(
                 f"{error}; --resume with --set calibration.robots=0 leaves the policy as it is"
             ) from None
-    policies.save_copy(out / "uncalibrated", learned, learned.meta)
-    meta = {**learned.meta, "calibration": facts}
-    policies.save_copy(out / "policy", learned, meta, correction)
 
 
 def build(

@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--outcome",
         choices=log.ENDS,
-        help="how the episode ended; required only for fell and collided",
+        help="how the episode ended; reached and timeout are seen in the log",
     )
     parser.add_argument(
         "--out", type=Path, default=Path("runs/diagnosis"), help="results folder (runs/diagnosis)"

@@ -144,11 +144,13 @@ def test_leaps_are_planned_from_the_clock_and_the_speed(
     is no speed.
     """
     driver = HierarchyDriver(law, HighLevelConfig(commands=CONFIG.commands))
-    clocks, speeds, plan_steps = [], [], LeapPlan.steps
+    clocks, speeds, cycles, plan_steps = [], [], [], LeapPlan.steps
 
     def steps(plan: LeapPlan, rows: Array, motion: Motion, landing: Landing) -> tuple[Array, Array]:
         loco = driver._loco
         clocks.extend(wrap_angle(2.0 * np.pi * (motion.clock - loco.clock.clock[rows])))
+        wanted = Motion.of(loco, rows, motion.x, motion.speed, motion.commanded).cycles
+        cycles.append((motion.cycles, wanted))
         speeds.extend(motion.speed - loco.world.state.lin_vel[rows, 0])
         return plan_steps(plan, rows, motion, landing)
 
@@ -158,6 +160,9 @@ def test_leaps_are_planned_from_the_clock_and_the_speed(
     assert len(clocks) > 500
     np.testing.assert_allclose(clocks, 0.0, atol=1e-5)
     assert np.abs(speeds).max() < 0.6
+    counted, wanted = np.concatenate(cycles, axis=1)
+    np.testing.assert_allclose(counted, wanted, atol=1e-5)
+    assert (counted == 0.0).sum() >= 48 and counted.max() > 3.0
 
 
 def test_the_slope_is_seen_by_the_probes_at_either_side(

@@ -66,7 +66,8 @@ class Limit:
     Attributes:
         unit: unit of the error.
         stretch: limit on its mean over ``LOOK_BACK``.
-        episode: limit on its mean over a whole episode, by which a timeout is judged.
+        episode: limit on its mean over a whole episode, by which a timeout is judged if tracking
+            can be judged for longer than that.
     """
 
     unit: str

@@ -218,8 +218,12 @@ def load_high(
             raise MisfitError(
                 f"{path}: trained for a low policy with robot.{field.name} {wanted}, not {given}"
             )
+    observed = width(high_layout(config))
+    if observed != high.obs_dim:
+        raise ConfigError(
+            f"{path}: trained for a high policy that observes {observed} values, not {high.obs_dim}"
+        )
     for what, wanted, given in (
-        ("a high policy that observes {} values", width(high_layout(config)), high.obs_dim),
         ("a low policy that observes {} values", observation, low.actor_dim),
         (
             "a low policy with a control step of {} s",

@@ -40,7 +40,7 @@ class Training:
 
     Attributes:
         editions: of the benchmark, keyed by "low" and "high", see ``editions_of``.
-        robot: what differs from the benchmark's robot and physics, see ``robot_changes``.
+        robot: what differs from the benchmark's robot and control step, see ``robot_changes``.
     """
 
     editions: Mapping[str, int]

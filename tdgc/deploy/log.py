@@ -381,7 +381,8 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
         told: how the episode ended, if the log does not show it.
 
     Raises:
-        LogError: see ``outcome``; or the robot fell long after its last decision.
+        LogError: see ``outcome``; or the robot fell, collided or left its tile when no decision was
+            carried out any more.
     """
     seen, begin = log.values, log.decisions
     end = np.minimum(begin + controller.decimation, len(log.time) - 1)

@@ -151,8 +151,6 @@ class Run:
                 raise unsaved
             if finished:
                 finish()
-                # Even if nothing was left to train, these are the settings of the result now.
-                write_json(self.folder / "config.json", to_dict(self.config))
             else:
                 self.interruption.tell(self.folder)
 

@@ -57,6 +57,8 @@ _LENGTH_PRICE = 2.0  # 1/m^2, for the squared distance of rear feet from where t
 # 4 with neither rule, 23 and 5 with the first alone (21 and 8 with 0.5 of the cycle), and 24 and 11
 # with both at 0.5 of the cycle (docs/experiments.md).
 _DECIDED, _CHANGE_PRICE = 0.4, 0.5
+#: The gait of leaps, as in the last three commands.
+PRONK = gait_embedding(GAITS.index("pronk"))
 #: Commands that decide on the next stride: step frequency and stance length.
 STRIDE_COMMANDS = [INDEX["frequency"], INDEX["stance_length"]]
 # How many are tried at each decision, evenly over the command ranges. Neighbours move a landing by
@@ -66,7 +68,6 @@ FREQUENCIES, LENGTHS = 25, 11
 # from rest, and 1.14 m/s in the long run when 1.2 is commanded. Without this model, landings at a
 # trench right behind the start were misjudged by 7 cm.
 _RISE, _REACHED = 0.3, 0.95  # time constant in s; share of the commanded speed that is reached
-_PRONK = gait_embedding(GAITS.index("pronk"))
 # Choices about as good as the best are averaged: the price that reduces a choice's weight by a
 # factor of e, and how many Hz and m it may be from the best, so that a short leap is never averaged
 # with a long one.
@@ -111,7 +112,8 @@ class Landing:
 
         Args:
             loco: robots that leap along x.
-            rows: robots to be looked at; in a gait's first cycle none has leapt yet.
+            rows: robots to be looked at. Landings in a gait's first cycle do not count: some robots
+                only stand there.
             before: (n,) their clocks a control step ago.
             rate: weight of one landing in the estimate.
         """
@@ -174,7 +176,7 @@ class Motion(NamedTuple):
         """The motion of the robots ``rows`` (n,), with their own clocks and strides."""
         frequency, length = loco.command[rows][:, STRIDE_COMMANDS].T
         clock = loco.clock
-        leaps = (clock.embedding[rows] == _PRONK).all(axis=1)
+        leaps = (clock.embedding[rows] == PRONK).all(axis=1)
         cycles = np.where(leaps, clock.cycles[rows], 0.0)
         return cls(x, speed, commanded, clock.clock[rows], cycles, frequency, length)
 
@@ -295,7 +297,7 @@ class LeapPlan:
             for cycles in (motion.cycles, motion.cycles + to_go)
         )
         hurried = np.clip(robot.start_cycles - motion.cycles, 0.0, to_go)
-        # It falls in proportion to the cycles, so the mean is right to within 1 % of a cycle.
+        # It falls in proportion to the cycles, so the mean is right to within 2 %.
         time = hurried[:, None] / (0.5 * (now + then)) + (to_go - hurried)[:, None] / asked
         return time, then
 
@@ -324,7 +326,7 @@ def leap_command(
     command[:, INDEX["duration"]] = np.clip(DURATION, *ranges.duration)
     command[:, INDEX["frequency"]] = frequency
     command[:, INDEX["stance_length"]] = length
-    command[:, 12:] = gait_embedding(GAITS.index("pronk"))
+    command[:, 12:] = PRONK
 
 
 def steer_leap(

@@ -24,6 +24,7 @@ from tdgc.tasks.leaps import (
     FREQUENCIES,
     HEADING_GAIN,
     LENGTHS,
+    PRONK,
     SPEED,
     Landing,
     LeapPlan,
@@ -214,7 +215,7 @@ class Teacher:
 
     def watch(self, loco: Locomotion, seconds: float) -> None:
         """Update the speed estimates; to be called once per decision of ``seconds``."""
-        leaps = self._leaping(loco.world.state.position[:, 0] - self._origin[:, 0])
+        leaps = (loco.clock.embedding == PRONK).all(axis=1)
         _, faster = speed_up(self.speed, self._leap_speed, seconds)
         self.speed = np.where(leaps, faster, self.speed)
         seen = 1.0 - 0.5 ** (seconds / _HALF_LIFE)
@@ -243,7 +244,7 @@ class Teacher:
         for way, toward_bearing in ((command, bearing), (self.other, second)):
             way[:, WAY] = self._walk(state.yaw, distance, toward_bearing, top_speed, detour, climb)
         self.price[:] = 0.0
-        rows = np.flatnonzero(self._leaping(local[:, 0]))
+        rows = np.flatnonzero((local[:, 0] >= self._start) & (local[:, 0] < self._end))
         if rows.size and self._landing is not None:
             leaps = np.tile(self._leap, (len(rows), 1))
             ways = bearing[rows], state.yaw[rows]
@@ -255,10 +256,6 @@ class Teacher:
             command[rows], self.price[rows] = leaps, lesson.price
             self.other[rows], self.dearer[rows] = leaps, 0.0
         return command
-
-    def _leaping(self, x: Array) -> NDArray[np.bool_]:
-        """Robots that leap at (M,) m along their tiles, (M,)."""
-        return (x >= self._start) & (x < self._end)
 
     def _slope_at(self, local: Array) -> Array:
         """Tangents of the slopes at (M, 2) m in the tiles' frames, (M,)."""
