@@ -3,6 +3,8 @@
 import functools
 import multiprocessing as mp
 import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -71,3 +73,18 @@ def test_who_wants_no_more_results_waits_for_none() -> None:
     results = run_jobs(sleep, [0.0, 1000.0], 2)
     assert next(results) == 0.0
     results.close()
+
+
+STOPS = """
+import time
+from tdgc.parallel.jobs import run_jobs
+results = run_jobs(time.sleep, [0.0, *[1000.0] * 8], 2)
+next(results)
+results.close()
+"""
+
+
+def test_jobs_that_are_given_up_leave_no_traceback() -> None:
+    """Neither those under way nor those that have not begun."""
+    result = subprocess.run([sys.executable, "-c", STOPS], capture_output=True, text=True)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
