@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import hashlib
+import io
 import json
 import os
 import tempfile
@@ -81,12 +82,11 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, An
     Raises:
         OSError: the file cannot be written.
     """
-    with atomic(path) as partial, open(partial, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(columns))
-        writer.writeheader()
-        writer.writerows(rows)
-        file.flush()
-        os.fsync(file.fileno())  # so that the rename never outlives the content
+    content = io.StringIO(newline="")
+    writer = csv.DictWriter(content, list(columns))
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, content.getvalue())
 
 
 def make_folder(folder: Path) -> None:

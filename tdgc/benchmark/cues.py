@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from tdgc.benchmark.memory import Obstacles, Profile, Reckoning
 from tdgc.config import HighLevelConfig, LowLevelConfig
-from tdgc.sim.commands import INDEX, CommandDecoder, default_command
+from tdgc.sim.commands import INDEX, CommandDecoder, default_command, gait_index
 from tdgc.sim.gaits import raw_phase
 from tdgc.sim.observation import columns
 from tdgc.sim.robot import Array, wrap_angle
 from tdgc.sim.tile import GOAL_X, ZONE
+from tdgc.tasks.command_draw import PRONK
 from tdgc.tasks.high_observation import GOAL_SCALE, SEMANTIC, high_layout
 from tdgc.tasks.leaps import (
     BEYOND,
-    PRONK,
     STRIDE_COMMANDS,
     Landing,
     LeapPlan,
@@ -192,7 +192,7 @@ class CuesLaw:
         phase = np.arctan2(cue["clock"][:, 1], cue["clock_cosine"][:, 1])
         clock = raw_phase(np.mod(phase / (2.0 * np.pi), 1.0), before[:, INDEX["duration"]])
         went, memory.clock = np.mod(clock - memory.clock, 1.0), clock
-        leapt = (before[:, 12:] == PRONK).all(axis=1)
+        leapt = gait_index(before) == PRONK
         memory.leapt = np.where(leapt, memory.leapt + went, 0.0)
         leaping = []
         for i in np.flatnonzero(memory.gap).tolist():

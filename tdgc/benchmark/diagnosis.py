@@ -160,8 +160,8 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
     towards = asked_towards(trace, intervals)
     # Without a tile, the outcome is reported rather than measured: "collided" then means that the
     # robot did not hit the ground.
-    tripped = trace.outcome == "collided" and tile is not None and not held[-1]
-    down = (trace.outcome == "fell" and not held[-1]) or tripped
+    hit = held[-1] or (trace.outcome == "collided" and tile is None)
+    fallen = trace.outcome in ("fell", "collided")
     obstacle = "an obstacle" if tile is None else _obstacle(tile.family)
     if trace.family == "mixed" or trace.level > MAX_LEVEL:
         blamed = "terrain", "never trained on"
@@ -171,11 +171,11 @@ def _judge(trace: Trace, tile: Tile | None, hips: float) -> tuple[tuple[str, str
         blamed = "decisions", "walked blindly into a trench"
     elif lost:
         blamed = "execution", f"lost track of {' and '.join(lost)}"
-    elif down and towards > 0.0:
+    elif fallen and not hit and towards > 0.0:
         blamed = "execution", "lost its footing on the way to the goal"
-    elif down:
+    elif fallen and not hit:
         blamed = "decisions", "lost its footing on the way elsewhere"
-    elif trace.outcome in ("fell", "collided"):
+    elif fallen:
         blamed = "decisions", f"steered into {obstacle}"
     elif trace.outcome == "left_tile":
         blamed = "decisions", "steered off the tile"

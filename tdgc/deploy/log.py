@@ -41,8 +41,9 @@ DECIDED = ("family", "probes", "probe_age", "decision")
 #: in rad in the map frame of the goal. With neither, velocity and yaw rate are unknown; a
 #: heading from the gyro alone drifts.
 OPTIONAL = {"gyro": 3, "yaw": 1}
-# Of an episode; only a simulator's log ends in ``left_tile``.
-ENDS = ("reached", "fell", "collided", "left_tile", "timeout")
+# Ends of an episode that its log does not show; only a simulator's log ends in ``left_tile``.
+UNSEEN = ("fell", "collided", "left_tile")
+ENDS = ("reached", *UNSEEN, "timeout")
 _SAME = 5e-3  # in the value's own unit: logs with four decimals differ by up to 3e-3, in leaps
 # Share of a step: at 50 Hz the millisecond to which a program may round its time stamps.
 _PUNCTUAL = 0.05
@@ -349,7 +350,7 @@ def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
             "reached" but the log never reaches the goal, or "timeout" but it does, or ends before
             the horizon.
     """
-    if told in ENDS[1:4]:
+    if told in UNSEEN:
         return told
     goals, task = log.values["goal"], controller.high.table["task"]
     distance = np.linalg.norm(goals, axis=1)
@@ -364,7 +365,7 @@ def outcome(log: Log, controller: Controller, told: str | None = None) -> str:
     ends = f"{log.name}: ends at {log.time[-1]:.2f} s"
     if told == "timeout":
         raise LogError(f"{ends}, before the horizon of {task['horizon']['value']:g} s")
-    how = f"--outcome {' or '.join(ENDS[1:3])}"
+    how = f"--outcome {' or '.join(UNSEEN[:2])}"
     raise LogError(f"{ends}, {distance[-1]:.2f} m from the goal; say how with {how}")
 
 
@@ -386,7 +387,7 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
     """
     seen, begin = log.values, log.decisions
     end = np.minimum(begin + controller.decimation, len(log.time) - 1)
-    if told in ENDS[1:4] and end[-1] < len(log.time) - 1:
+    if told in UNSEEN and end[-1] < len(log.time) - 1:
         raise LogError(
             f"{log.name}: no decision after {log.time[begin[-1]]:.2f} s led to what happened at "
             f"{log.time[-1]:.2f} s: it was no longer part of the episode"

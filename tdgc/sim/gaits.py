@@ -109,6 +109,17 @@ def begun(cycles: NDArray[np.floating], first: float) -> NDArray[np.float64]:
     return np.minimum(cycles / first, 1.0) if first > 0.0 else np.ones_like(cycles)
 
 
+def executed_frequency(
+    asked: NDArray[np.floating], cycles: NDArray[np.floating], start: float, first: float
+) -> NDArray[np.float64]:
+    """Frequency in Hz at which a gait is carried out after ``cycles`` if ``asked`` Hz is commanded.
+
+    It begins at ``start`` Hz or faster and slows to the commanded one over the ``first`` cycles.
+    ``asked`` and ``cycles`` are of shapes that broadcast.
+    """
+    return asked + (1.0 - begun(cycles, first)) * np.maximum(start - asked, 0.0)
+
+
 class PhaseClock:
     """One clock per robot, g <- (g + dt f) mod 1, and the four foot phases derived from it.
 

@@ -24,7 +24,7 @@ from tdgc.config import (
 )
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX, NAMES, SIDEWAYS, default_command, gait_index, observed_command
-from tdgc.sim.gaits import GAITS, PhaseClock, begun, foot_phases
+from tdgc.sim.gaits import GAITS, PhaseClock, begun, executed_frequency, foot_phases
 from tdgc.sim.geometry import Geometry
 from tdgc.sim.observation import (
     JOINT_FLIP,
@@ -148,10 +148,11 @@ class Locomotion:
         slows to the commanded frequency over ``start_cycles``. At 2 Hz pronk and bound have a
         flight phase of a quarter of a second, and a robot's first jump is too weak for that.
         """
-        asked, command = self.command[:, _FREQUENCY], self.command.copy()
-        late = begun(self.clock.cycles, self.robot.start_cycles)
-        least = min(self.robot.start_frequency, self.frequency_limit)
-        command[:, _FREQUENCY] += (1.0 - late) * np.maximum(least - asked, 0)
+        command, cycles = self.command.copy(), self.clock.cycles
+        start = min(self.robot.start_frequency, self.frequency_limit)
+        command[:, _FREQUENCY] = executed_frequency(
+            command[:, _FREQUENCY], cycles, start, self.robot.start_cycles
+        )
         return command
 
     def followed(self) -> Array:

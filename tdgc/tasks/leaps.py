@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from tdgc.config import CommandRanges, LowLevelConfig, RobotConfig
 from tdgc.sim.bullet_world import BulletWorld
 from tdgc.sim.commands import INDEX
-from tdgc.sim.gaits import GAITS, begun, gait_embedding
+from tdgc.sim.gaits import GAITS, PhaseClock, executed_frequency, gait_embedding
 from tdgc.sim.locomotion import Locomotion
 from tdgc.sim.robot import Array
 from tdgc.sim.tile import TILE_SIZE
@@ -57,8 +57,7 @@ _LENGTH_PRICE = 2.0  # 1/m^2, for the squared distance of rear feet from where t
 # 4 with neither rule, 23 and 5 with the first alone (21 and 8 with 0.5 of the cycle), and 24 and 11
 # with both at 0.5 of the cycle (docs/experiments.md).
 _DECIDED, _CHANGE_PRICE = 0.4, 0.5
-#: The gait of leaps, as in the last three commands.
-PRONK = gait_embedding(GAITS.index("pronk"))
+_PRONK = gait_embedding(GAITS.index("pronk"))
 #: Commands that decide on the next stride: step frequency and stance length.
 STRIDE_COMMANDS = [INDEX["frequency"], INDEX["stance_length"]]
 # How many are tried at each decision, evenly over the command ranges. Neighbours move a landing by
@@ -150,6 +149,11 @@ def foothold_risk(x: NDArray[np.floating], trenches: Array, clear: float = CLEAR
     return np.where(inside > 0.0, _FALL, near)
 
 
+def leaping(clock: PhaseClock) -> NDArray[np.bool_]:
+    """Robots whose gait, as carried out, is that of leaps, (M,)."""
+    return (clock.embedding == _PRONK).all(axis=1)
+
+
 class Motion(NamedTuple):
     """State of n robots that leap, (n,) each.
 
@@ -176,8 +180,7 @@ class Motion(NamedTuple):
         """The motion of the robots ``rows`` (n,), with their own clocks and strides."""
         frequency, length = loco.command[rows][:, STRIDE_COMMANDS].T
         clock = loco.clock
-        leaps = (clock.embedding[rows] == PRONK).all(axis=1)
-        cycles = np.where(leaps, clock.cycles[rows], 0.0)
+        cycles = np.where(leaping(clock)[rows], clock.cycles[rows], 0.0)
         return cls(x, speed, commanded, clock.clock[rows], cycles, frequency, length)
 
 
@@ -289,14 +292,13 @@ class LeapPlan:
     def _touchdown(self, motion: Motion) -> tuple[Array, Array]:
         """Time in s to the next landing with each frequency, and the frequency that is carried out
         then, (n, frequencies) each; see ``Locomotion.executed``."""
-        asked, robot = self._frequencies, self._robot
-        to_go = 1.0 - motion.clock
-        hurry = np.maximum(robot.start_frequency - asked, 0.0)
+        asked, to_go = self._frequencies, 1.0 - motion.clock
+        start, first = self._robot.start_frequency, self._robot.start_cycles
         now, then = (
-            asked + hurry * (1.0 - begun(cycles, robot.start_cycles))[:, None]
+            executed_frequency(asked, cycles[:, None], start, first)
             for cycles in (motion.cycles, motion.cycles + to_go)
         )
-        hurried = np.clip(robot.start_cycles - motion.cycles, 0.0, to_go)
+        hurried = np.clip(first - motion.cycles, 0.0, to_go)
         # It falls in proportion to the cycles, so the mean is right to within 2 %.
         time = hurried[:, None] / (0.5 * (now + then)) + (to_go - hurried)[:, None] / asked
         return time, then
@@ -326,7 +328,7 @@ def leap_command(
     command[:, INDEX["duration"]] = np.clip(DURATION, *ranges.duration)
     command[:, INDEX["frequency"]] = frequency
     command[:, INDEX["stance_length"]] = length
-    command[:, 12:] = PRONK
+    command[:, 12:] = _PRONK
 
 
 def steer_leap(

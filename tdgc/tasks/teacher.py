@@ -24,12 +24,12 @@ from tdgc.tasks.leaps import (
     FREQUENCIES,
     HEADING_GAIN,
     LENGTHS,
-    PRONK,
     SPEED,
     Landing,
     LeapPlan,
     Motion,
     leap_command,
+    leaping,
     speed_up,
     steer_leap,
 )
@@ -215,9 +215,8 @@ class Teacher:
 
     def watch(self, loco: Locomotion, seconds: float) -> None:
         """Update the speed estimates; to be called once per decision of ``seconds``."""
-        leaps = (loco.clock.embedding == PRONK).all(axis=1)
         _, faster = speed_up(self.speed, self._leap_speed, seconds)
-        self.speed = np.where(leaps, faster, self.speed)
+        self.speed = np.where(leaping(loco.clock), faster, self.speed)
         seen = 1.0 - 0.5 ** (seconds / _HALF_LIFE)
         self.speed += seen * (loco.world.state.heading_vel[:, 0] - self.speed)
 
