@@ -291,12 +291,9 @@ class Evaluation:
         return drivers
 
     def make_room(self) -> None:
-        """Create the results folder, if there will be any; only a table replaces an earlier one."""
-        if self.mode == "tracking":
-            make_folder(self.out)
-        elif self.mode == "table":
-            folders = {"films": self.filmed > 0, "traces": self.traced is not None}
-            make_room(self.out, report.DERIVED, folders)
+        """Delete an earlier table in the results folder, and make the folders of this one."""
+        folders = {"films": self.filmed > 0, "traces": self.traced is not None}
+        make_room(self.out, report.DERIVED, folders)
 
 
 @dataclass(frozen=True)
@@ -344,13 +341,16 @@ def run_one(
     )
 
 
-def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]) -> list[str]:
+def run_table(
+    evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver], trained_on: Training
+) -> list[str]:
     """Run all cells and write all results.
 
     Args:
         evaluation: what to run.
         low: the low policy.
         drivers: of all policies, by name.
+        trained_on: what the policies were trained on.
 
     Returns:
         What could not be written, one line each.
@@ -358,7 +358,7 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
     Raises:
         BaseException: what stopped it; the table of the complete cells is written first.
     """
-    e, out, trained_on = evaluation, evaluation.out, training(low, drivers)
+    e, out = evaluation, evaluation.out
     cells = plan(list(drivers), e.conditions, e.families, e.levels, e.episodes)
     work = functools.partial(
         run_one, low=low, drivers=drivers, seed=e.seed, filmed=e.filmed, traced=e.traced
@@ -403,7 +403,11 @@ def run_table(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver]
 
 
 def training(low: Policy, drivers: Mapping[str, Driver]) -> Training:
-    """What the policies were trained on."""
+    """What the policies were trained on.
+
+    Raises:
+        InputError: the edition that a policy names is not a number.
+    """
     used = {"low": low.meta}
     pair = drivers.get("tdgc")
     if isinstance(pair, HierarchyDriver) and isinstance(pair.high, Policy):
@@ -425,11 +429,10 @@ def print_effect(effect: dict[str, Any]) -> None:
         print(f"of {found['tdgc']['n']} episodes {found['gained']} gained, {found['lost']} lost")
 
 
-def run_tracking(evaluation: Evaluation, low: Policy) -> None:
+def run_tracking(evaluation: Evaluation, low: Policy, trained_on: Training) -> None:
     """Measure the low policy alone, print the results and write tracking.json."""
     e = evaluation
     result = tracking(low, e.episodes, e.seed, e.workers, e.run_jobs)
-    trained_on = training(low, {})
     about = {EDITIONS: trained_on.editions, ROBOT: trained_on.robot}
     write_json(e.out / "tracking.json", result | about)
     print("gait    velocity RMSE  yaw rate RMSE  contact match")
@@ -462,15 +465,18 @@ def run_window(evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver
 def main(arguments: list[str] | None = None) -> int:
     evaluation = Evaluation.of(parse(arguments))
     low, config = load_low(evaluation.low)
-    # Fail before earlier results are removed.
+    # Fail before anything takes long or earlier results are removed.
     BulletWorld(1, config.robot, config.physics).close()
+    if evaluation.mode not in gui.MODES:
+        make_folder(evaluation.out)
     drivers = evaluation.drivers(low, config)
-    evaluation.make_room()
+    trained_on = training(low, drivers)
     problems: list[str] = []
     if evaluation.mode == "tracking":
-        run_tracking(evaluation, low)
+        run_tracking(evaluation, low, trained_on)
     elif evaluation.mode == "table":
-        problems = run_table(evaluation, low, drivers)
+        evaluation.make_room()
+        problems = run_table(evaluation, low, drivers, trained_on)
     else:
         run_window(evaluation, low, drivers)
     for problem in problems:

@@ -26,6 +26,7 @@ from tdgc.config import (
     ConfigError,
     LowLevelConfig,
     LowTrainConfig,
+    RandomisationConfig,
     RobotConfig,
     read_json,
     to_dict,
@@ -71,6 +72,10 @@ def check(config: LowTrainConfig) -> None:
     """
     if config.env.terrain != LowLevelConfig.terrain:
         raise ConfigError("'env.terrain' has no effect: robots train on both, see plane_share")
+    usual, drawn = RandomisationConfig(), config.env.randomisation
+    for name in ("noise_probes", "probe_delay"):
+        if getattr(drawn, name) != getattr(usual, name):
+            raise ConfigError(f"'env.randomisation.{name}' has no effect: the low policy is blind")
     if config.plane_share == 1.0:
         raise ConfigError("'plane_share' must be from 0 to below 1, not 1")
     check_batch("'ppo.batch_size'", config.ppo.batch_size)

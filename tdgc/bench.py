@@ -321,7 +321,7 @@ def check_flags(args: argparse.Namespace) -> None:
     if args.robots < 1:
         raise InputError(f"--robots must be at least 1, not {args.robots}")
     if not 0.0 < args.seconds < math.inf:
-        raise InputError(f"--seconds must be above 0, not {args.seconds:g}")
+        raise InputError(f"--seconds must be above 0 and finite, not {args.seconds:g}")
 
 
 def choose_workers(args: argparse.Namespace) -> int:

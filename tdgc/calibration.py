@@ -225,6 +225,7 @@ def calibrate(
         for k, count in enumerate(counts)
     ]
     walks = []
+    tick(0.0)
     for walk in run_jobs(operator.call, jobs, workers):
         walks.append(walk)
         tick(_WALKING * len(walks) / len(jobs))
@@ -266,6 +267,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name, least in (("robots", LEAST_ROBOTS), ("seed", 0), ("workers", 1)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be {least} or more, not {getattr(args, name)}")
+    if args.seed >= 2**32:
+        raise ValueError(f"--seed must be below 2**32, not {args.seed}")
     low = load_low(args.low)[0]
     if low.meta.get("calibration", {}).get("robots"):
         raise ValueError(

@@ -55,7 +55,6 @@ from tdgc.sim.commands import (
 from tdgc.sim.gaits import FEET, GAIT_TABLE, GAITS
 from tdgc.sim.geometry import Geometry, read_geometry
 from tdgc.sim.locomotion import Locomotion, actor_layout
-from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS, Array, nominal_height, nominal_pose, pd_torque
 from tdgc.sim.terrain import make_tile
 from tdgc.sim.tile import TileField
@@ -113,11 +112,6 @@ def load_pair(low: str | Path, high: str | Path) -> Pair:
         ValueError: a file cannot be used, or the policies do not fit each other.
     """
     low_policy, low_config = load_low(low)
-    size = width(actor_layout(low_config.robot, low_config.gyro))
-    if low_policy.actor_dim != size:
-        raise ConfigError(
-            f"{low}: its configuration gives {size} observations, it takes {low_policy.actor_dim}"
-        )
     high_policy, high_config = load_high(high, low_policy, low_config)
     if high_policy.kind != "lstm":
         raise ConfigError(f"{high}: only a recurrent high policy can be exported")
@@ -180,7 +174,8 @@ def _joint_control(robot: RobotConfig, geometry: Geometry, physics: PhysicsConfi
 def _high_table(pair: Pair, graph: HighGraph) -> Table:
     config, physics, robot = pair.high_config, pair.low_config.physics, pair.low_config.robot
     step = config.decimation * physics.control_dt
-    ranges = config.commands or pair.low_config.commands
+    ranges = config.commands
+    assert ranges is not None  # filled in by ``load_high``
     stand = CommandDecoder(ranges).nearest(default_command())
     stand[: len(VELOCITIES)] = 0.0  # stays where it is, even if ``ranges`` has no speed 0
     probes = any(signal.name == "probes" for signal in graph.inputs)
@@ -325,6 +320,10 @@ def _copy_robot(robot: RobotConfig, folder: Path) -> Path:
         # Numbered, as meshes from two folders may have one name.
         mesh.set("filename", names.setdefault(path.resolve(), f"meshes/{len(names)}_{path.name}"))
     copied = folder / urdf.path.name
+    if copied.exists() and copied.samefile(urdf.path):
+        raise ConfigError(
+            f"'{folder}' holds the robot itself, {urdf.path}; export to another folder"
+        )
     shutil.copyfile(urdf.path, copied)
     if names:
         (folder / "meshes").mkdir(exist_ok=True)

@@ -31,7 +31,14 @@ from tdgc.benchmark.results import (
     salvage,
     write_results,
 )
-from tdgc.config import HighLevelConfig, LowLevelConfig, RobotConfig, to_dict, with_overrides
+from tdgc.config import (
+    HighLevelConfig,
+    LowLevelConfig,
+    PhysicsConfig,
+    RobotConfig,
+    to_dict,
+    with_overrides,
+)
 from tdgc.deploy.controller import Controller
 from tdgc.deploy.log import LogWriter
 from tdgc.errors import require, script
@@ -169,19 +176,27 @@ def run_cell(
     return episodes, recordings
 
 
-def robot_changes_of(controller: Controller) -> list[str]:
-    """List what the exported robot has in place of the benchmark's, see ``robot_changes``."""
+def training(controller: Controller) -> Training:
+    """What the exported pair was trained on.
+
+    Raises:
+        InputError: the edition is not a number.
+    """
     robot, usual = controller.robot(), RobotConfig()
     if checksum(Path(robot.urdf)) == checksum(urdf_path(usual)):  # the folder has a copy
         robot = dataclasses.replace(robot, urdf=usual.urdf)
-    return robot_changes(LowLevelConfig(robot=robot))
+    physics = PhysicsConfig(control_dt=controller.dt)
+    tables = {"low": controller.low.table["policy"], "high": controller.high.table["policy"]}
+    return Training(
+        editions_of(tables), robot_changes(LowLevelConfig(robot=robot, physics=physics))
+    )
 
 
-def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
+def run_table(args: argparse.Namespace, config: "MujocoConfig", trained_on: Training) -> list[str]:
     """Run all cells and write all results; return problems with the films, one line each.
 
     Raises:
-        Exception: one of ``FAILURES``; the table of the complete cells is still written.
+        BaseException: what stopped it; the table of the complete cells is written first.
     """
     settings = {"export": str(args.export), "seed": args.seed, "mujoco": to_dict(config)}
     write_json(args.out / "mujoco.json", settings)
@@ -195,9 +210,6 @@ def run_table(args: argparse.Namespace, config: "MujocoConfig") -> list[str]:
         logs=args.out / "logs",
         logged=args.log,
     )
-    controller = load(args.export)
-    tables = {"low": controller.low.table["policy"], "high": controller.high.table["policy"]}
-    trained_on = Training(editions_of(tables), robot_changes_of(controller))
     episodes: list[Episode] = []
     recordings: list[Recording] = []
     with salvage(args.out, episodes, cells, trained_on) as bar:
@@ -254,7 +266,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     groups.looked_at.add_argument(
         "--gui",
         action="store_true",
-        help="open MuJoCo's viewer instead, on the first tile of the first family and level",
+        help="open MuJoCo's viewer instead, on the first tile of the first family and level "
+        "(--episodes, --workers and --out then have no effect)",
     )
     return parser.parse_args(arguments)
 
@@ -295,9 +308,10 @@ def main(arguments: list[str] | None = None) -> int:
     if args.gui:
         show(args, config)
         return 0
+    trained_on = training(load(args.export))  # before earlier results are removed
     folders = {"logs": args.log > 0, "films": args.video > 0}
     make_room(args.out, report.DERIVED, folders)
-    problems = run_table(args, config)
+    problems = run_table(args, config, trained_on)
     for problem in problems:
         print(f"tdgc.mujoco: {problem}", file=sys.stderr)
     return 1 if problems else 0

@@ -2,13 +2,16 @@
 
 import itertools
 import json
+import os
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch as th
 
+import evaluate
 import train_high
 from tdgc import policies
 from tdgc.ablate import trials
@@ -16,7 +19,9 @@ from tdgc.ablate.__main__ import choose, main, plan, without_missing
 from tdgc.ablate.table import describe, rows
 from tdgc.ablate.trials import Found, Result, Runner, Trial, changed_pair
 from tdgc.ablate.variants import HELPS, VARIANTS, WHOLE, Variant, variants
+from tdgc.benchmark import evaluation
 from tdgc.config import NO_TEACHER, HighLevelConfig, HighTrainConfig, LowLevelConfig, with_overrides
+from tdgc.errors import StoppedError
 from tdgc.learn.recurrent import FastRecurrentPolicy
 from tdgc.learn.run import Interruption, sole_user
 from tdgc.policies.correction import Correction
@@ -150,6 +155,7 @@ def test_an_ablation_goes_on_where_it_was_and_keeps_what_is_done(
     One of its trials cannot run. Its policy is byte for byte the one that train_high.py trains.
     """
     monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(evaluation, "HORIZON", 0.2)
     out = tmp_path / "ablation"
     command = [*TINY, "--only", "full,fixed-pose,uncalibrated", "--seeds", "5", "--out", str(out)]
     asked = []
@@ -205,6 +211,7 @@ def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
     So ``full`` fails, and with it ``fixed-pose``, which needs it; ``gp`` needs no training.
     """
     monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(evaluation, "HORIZON", 0.2)
     flags = [*TINY, "--set", "ppo.minibatches=5", "--only", "full,fixed-pose,gp"]
     assert main([*flags, "--out", str(tmp_path)]) == 1
     table = json.loads((tmp_path / "ablation.json").read_text())["rows"]
@@ -212,6 +219,28 @@ def test_a_trial_that_cannot_be_trained_is_named_and_the_others_are_kept(
     assert table[1]["errors"] == {"42": "it needs 'full' with seed 42, which is missing"}
     assert (table[2]["n"], table[2]["errors"]) == (1, {})
     assert capsys.readouterr().err.count("tdgc.ablate: ") == 2
+
+
+def test_a_signal_after_the_last_update_stops_the_ablation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The training ends all the same; its evaluation waits for the next call."""
+
+    def train(flags: list[str]) -> int:
+        low = policies.load(LOW)
+        policies.save_copy(tmp_path / "full-7" / "policy", low, {**low.meta, "steps": 48})
+        (tmp_path / "full-7" / "config.json").write_text('{"steps": 48}')
+        Interruption(None)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return 0
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(train_high, "main", train)
+    monkeypatch.setattr(evaluate, "main", None)
+    runner = Runner(tmp_path, LOW, False, (), 48, "6", 1, 1, None)
+    with pytest.raises(StoppedError):
+        runner.run(Trial(named("full"), 7))
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 EPISODES = "evaluation/episodes.csv"
@@ -339,7 +368,7 @@ def test_a_report_has_all_that_is_done(tmp_path: Path, capsys: pytest.CaptureFix
 def test_without_a_correction_the_uncalibrated_variants_are_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    names = [variant.name for variant in without_missing(VARIANTS, LOW)]
+    names = [variant.name for variant in without_missing(VARIANTS, LOW, ())]
     assert "uncalibrated" not in names and "gp-uncalibrated" not in names
     assert len(names) == len(VARIANTS) - 2
     assert capsys.readouterr().out == (
@@ -347,7 +376,17 @@ def test_without_a_correction_the_uncalibrated_variants_are_left_out(
     )
     low = policies.load(LOW)
     policies.save_copy(tmp_path / "low", low, low.meta, corrected(low))
-    assert without_missing(VARIANTS, tmp_path / "low") == list(VARIANTS)
+    assert without_missing(VARIANTS, tmp_path / "low", ()) == list(VARIANTS)
+
+
+def test_without_imitation_its_policy_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    low = policies.load(LOW)
+    policies.save_copy(tmp_path / "low", low, low.meta, corrected(low))
+    kept = without_missing(VARIANTS, tmp_path / "low", ("imitation.steps=0",))
+    assert kept == [variant for variant in VARIANTS if variant.name != "imitation"]
+    assert capsys.readouterr().out == "imitation left out: nothing is imitated\n"
 
 
 def corrected(low: policies.Policy) -> Correction:

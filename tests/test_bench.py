@@ -34,7 +34,7 @@ def test_robots_are_spread_over_the_levels() -> None:
 
 def test_learning_leaves_the_threads_as_they_were() -> None:
     before = th.get_num_threads()
-    assert bench.learn(LowTrainConfig(), before + 1, 0.01) > 0.0
+    bench.learn(LowTrainConfig(), before + 1, 0.01)
     assert th.get_num_threads() == before
 
 
@@ -112,9 +112,9 @@ def test_an_updates_times_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
         ("--robots 0", "--robots must be at least 1, not 0\n"),
         ("--load --workers 2", "--load has its own settings: no --workers\n"),
         ("--update --seconds 5", "--update has its own settings: no --seconds\n"),
-        ("--seconds 0", "--seconds must be above 0, not 0\n"),
-        ("--seconds=-1", "--seconds must be above 0, not -1\n"),
-        ("--seconds nan", "--seconds must be above 0, not nan\n"),
+        ("--seconds 0", "--seconds must be above 0 and finite, not 0\n"),
+        ("--seconds=-1", "--seconds must be above 0 and finite, not -1\n"),
+        ("--seconds nan", "--seconds must be above 0 and finite, not nan\n"),
         ("--out {0}/file/out", "'{0}/file/out' cannot be used: Not a directory\n"),
     ],
 )

@@ -151,14 +151,11 @@ def short_walk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("short_walk")
-def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None:
+def test_robots_are_measured_beyond_the_ranges(low: Policy) -> None:
     given, reached = measure(low, 24, seed=5)
     assert len(given) == len(reached) <= 24 and reached.shape[1] == 3
     assert (np.abs(given[:, :3] - MIDDLE) <= 1.4 * HALF + 1e-9).all()
     assert (np.abs(given[:, :3] - MIDDLE) > HALF).any()
-    rows = {tuple(row) for row in given[:, 12:]}
-    assert rows <= {tuple(gait_embedding(g)) for g in range(len(GAITS))}
-    assert len(rows) >= 2
     twice = measure(low, 24, seed=5)
     assert (twice[0] == given).all() and (twice[1] == reached).all()
 
@@ -176,8 +173,13 @@ def test_robots_beside_one_that_diverges_do_not_count(
 
 
 def test_measured_velocities_are_those_that_robots_walk_at() -> None:
-    """Within its ranges the shipped policy, which is calibrated, nearly does what it is told."""
+    """Within its ranges the shipped policy, which is calibrated, nearly does what it is told.
+
+    It walks in all gaits.
+    """
     given, reached = measure(policies.load(PRETRAINED / "low"), 24, seed=5)
+    gaits = {tuple(row) for row in given[:, 12:]}
+    assert gaits == {tuple(gait_embedding(g)) for g in range(len(GAITS))}
     inside = (np.abs(given[:, :3] - MIDDLE) <= HALF).all(axis=1)
     for axis in (0, 2):
         asked = given[inside, axis]
@@ -214,6 +216,7 @@ def test_script(
         (["--low", "{0}/none"], "none.json: no such file"),
         (["--low", "{0}/low", "--robots", "63"], "--robots must be 64 or more, not 63"),
         (["--low", "{0}/low", "--seed", "-1"], "--seed must be 0 or more, not -1"),
+        (["--low", "{0}/low", "--seed", "4294967296"], "--seed must be below 2**32, not 429496"),
         (["--low", "tdgc/pretrained/high"], "high: not a low policy of this package"),
         (["--low", "tdgc/pretrained/low"], "low is calibrated already; give the policy"),
         (["--low", "{0}/low", "--workers", "0"], "--workers must be 1 or more, not 0"),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tdgc.benchmark import diagnosis, planted
+from tdgc.benchmark import diagnosis, evaluation, planted
 from tdgc.benchmark.diagnosis import (
     LIMITS,
     REACH,
@@ -67,7 +67,8 @@ def test_a_blindfold_is_the_decisions_fault(low, pair):
     assert len(layers) >= 3 and layers.count("decisions") >= 0.8 * len(layers)
 
 
-def test_a_blindfolds_trace_has_no_probes(low, pair):
+def test_a_blindfolds_trace_has_no_probes(low, pair, monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 1.0)
     (seen,) = planted.traced(HierarchyDriver(*pair), low[0], "rough", 0, 1, planted.SEED)
     (blind,) = planted.traced(Blindfold(*pair), low[0], "rough", 0, 1, planted.SEED)
     assert seen.probes and np.isfinite(seen["probe_00"][:-1]).all()
@@ -276,7 +277,8 @@ def test_a_trench_of_a_map_is_found(low, tmp_path):
         assert found.feature.endswith("m from trench 1 of 1")
 
 
-def test_the_teacher_is_not_blind(low):
+def test_the_teacher_is_not_blind(low, monkeypatch):
+    monkeypatch.setattr(evaluation, "HORIZON", 1.0)
     driver = TeacherDriver(low[1], Skill(Landing()))
     tracer = Tracer(driver)
     run_cell(Cell("teacher", "nominal", "gap", 4, 0, 1), low[0], driver, planted.SEED, [tracer])
@@ -383,6 +385,7 @@ def test_features_are_where_the_tile_has_them(family):
     if family == "gap":  # trenches are where the ground is lowered
         lowered = 0.05 * np.flatnonzero(heights < -0.3)
         starts = lowered[np.diff(lowered, prepend=-1.0) > 0.1]
+        assert len(starts) >= 3
         for k, x in enumerate(starts):
             ((name, distance),) = features(tile, float(x) + 0.05, 4.0)
             assert name == f"trench {k + 1} of {len(starts)}" and distance == 0.0

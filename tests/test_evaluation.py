@@ -347,6 +347,7 @@ def test_the_table_does_not_depend_on_the_processes(table, low, high, tmp_path):
 @pytest.mark.usefixtures("in_process")
 def test_without_a_high_level_the_baseline_runs_alone(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "SHIPPED_HIGH", tmp_path / "none")
+    monkeypatch.setattr(evaluation, "HORIZON", 0.2)
     flags = ["--levels", "10", "--families", "gap", "--episodes", "1", "--workers", "1"]
     assert evaluate.main([*flags, "--out", str(tmp_path / "out")]) == 0
     assert {row["policy"] for row in rows_of(tmp_path / "out")} == {"gp"}
@@ -377,10 +378,10 @@ GUI_CONDITION = "--gui shows the nominal condition: no --conditions"
         (["--policies", "wtw"], "unknown policy 'wtw'; allowed: all, tdgc, gp, cues, teacher"),
         (["--families", "gap,gap"], "family 'gap' is named twice"),
         (["--levels", "6-8,7"], "--levels '6-8,7' names a level twice"),
-        (["--levels", "13"], "--levels '13' must name levels from 0 to 12"),
+        (["--levels", "13"], "--levels '13' must name levels from 0 to 12, upwards"),
         (["--levels", "high"], "cannot read --levels 'high'; write e.g. 6-10 or 0,5,10"),
         (["--levels", "6-"], "cannot read --levels '6-'; write e.g. 6-10 or 0,5,10"),
-        (["--levels", "9-6,3"], "--levels '9-6,3' must name levels from 0 to 12"),
+        (["--levels", "9-6,3"], "--levels '9-6,3' must name levels from 0 to 12, upwards"),
         (["--policies", ""], "unknown policy ''; allowed: all, tdgc, gp, cues, teacher"),
         *((["--tracking", *flag], ALONE) for flag in NOT_OF_TRACKING),
         *(
@@ -416,7 +417,7 @@ GUI_CONDITION = "--gui shows the nominal condition: no --conditions"
             ["--set", "vx=1"],
             "unknown configuration key 'vx'; allowed: decoder, decision_rate, safety",
         ),
-        (["--set", "vx"], "cannot read --set 'vx'; write key=value, e.g. kp=25"),
+        (["--set", "vx"], "cannot read --set 'vx'; write key=value, e.g. a.b=0.5"),
         (["--tune", "none.json"], "none.json: No such file or directory"),
         (
             ["--set", "decoder.vx.high=1.5"],
@@ -489,9 +490,12 @@ def test_the_teacher_leads_on_any_terrain(tmp_path):
     flags = ["--policies", "teacher", "--conditions", "no-family", "--workers", "1"]
     flags += ["--families", f"{course},mixed", "--levels", "10", "--episodes", "2"]
     assert evaluate.main([*flags, "--out", str(out)]) == 0
-    outcomes = [(row["family"], row["outcome"]) for row in read_csv(out / "episodes.csv")]
-    assert {outcome for family, outcome in outcomes if family == str(course)} == {"reached"}
-    assert "mixed" in {family for family, _ in outcomes}
+    own, mixed = (
+        [row for row in read_csv(out / "episodes.csv") if row["family"] == family]
+        for family in (str(course), "mixed")
+    )
+    assert {row["outcome"] for row in own} == {"reached"}
+    assert mixed and all(float(row["path_m"]) > 3.0 for row in mixed)
 
 
 @pytest.mark.usefixtures("quick_landing")
@@ -665,6 +669,36 @@ def test_results_stay_if_the_robot_cannot_be_loaded(low, tmp_path, capsys):
     assert (tmp_path / "summary.json").read_text() == "earlier"
 
 
+@pytest.mark.parametrize(
+    ("meta", "message"),
+    [
+        ({"benchmark": "2"}, "'benchmark' must be"),
+        ({"config": {"gyro": False}}, "its configuration gives 87 observations, it takes 90"),
+    ],
+)
+def test_results_stay_if_the_low_policy_cannot_be_used(
+    meta, message, low, tmp_path, monkeypatch, capsys
+):
+    config = {**low.meta["config"], **meta.get("config", {})}
+    policies.save_copy(tmp_path / "low", low, {**low.meta, **meta, "config": config})
+    for mode, name in (("--policies=gp", "summary.json"), ("--tracking", "tracking.json")):
+        (tmp_path / name).write_text("earlier")
+        flags = [mode, "--low", str(tmp_path / "low"), "--out", str(tmp_path)]
+        assert evaluate.main(["--episodes", "1", "--workers", "1", *flags]) == 2
+        said = capsys.readouterr().err
+        assert message in said and said.count("\n") == 1
+        assert (tmp_path / name).read_text() == "earlier"
+
+
+def test_a_results_folder_that_cannot_be_made_is_refused_at_once(tmp_path, monkeypatch, capsys):
+    """Before the walks and leaps of a low policy without a high one are tried out."""
+    monkeypatch.setattr(evaluate, "find_manner", None)
+    monkeypatch.setattr(evaluate, "SHIPPED_HIGH", tmp_path / "none")
+    (tmp_path / "file").touch()
+    assert evaluate.main(["--policies", "teacher", "--out", str(tmp_path / "file" / "out")]) == 2
+    assert "cannot be used: Not a directory" in capsys.readouterr().err
+
+
 def test_ctrl_c_stops_what_called_the_script_too(tmp_path, monkeypatch):
     """The script raises ``SystemExit``; after a status the ablation would run its next trial."""
     monkeypatch.setattr(evaluate, "run_jobs", stopped(0, KeyboardInterrupt()))
@@ -694,7 +728,8 @@ def test_a_training_may_rewrite_the_policy_meanwhile(low, tmp_path, monkeypatch)
 
 
 @pytest.mark.usefixtures("in_process", "quick_landing")
-def test_cues_are_a_policy_of_the_script(tmp_path, capsys):
+def test_cues_are_a_policy_of_the_script(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluation, "HORIZON", 0.2)
     flags = ["--levels", "4", "--families", "pillar", "--episodes", "1", "--workers", "1"]
     assert evaluate.main([*flags, "--policies", "cues", "--out", str(tmp_path)]) == 0
     assert [row["policy"] for row in rows_of(tmp_path)] == ["cues"]

@@ -589,17 +589,22 @@ def test_what_is_complete_when_it_is_stopped_is_kept(
 def test_results_say_that_the_robot_is_not_the_benchmarks(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert runner.robot_changes_of(Controller(folder)) == []
+    assert runner.training(Controller(folder)).robot == []
     pair = shutil.copytree(folder, tmp_path / "export")
     path = pair / "low_interface.json"
     table = json.loads(path.read_text())
     table["joint_control"]["kp"]["value"] = [18.5] * 12
-    path.write_text(json.dumps(table))
+    for graph, rate in (("low", 40.0), ("high", 8.0)):
+        named = pair / f"{graph}_interface.json"
+        changed = table if graph == "low" else json.loads(named.read_text())
+        changed["rate"]["value"] = rate
+        named.write_text(json.dumps(changed))
     urdf = pair / table["robot"]["urdf"]["file"]
     urdf.write_text(urdf.read_text() + "<!-- mine -->")
     table["robot"]["urdf"]["sha256"] = checksum(urdf)
     path.write_text(json.dumps(table))
     changes = [f'robot.urdf="{urdf}", not "urdf/quadruped.urdf"', "robot.kp=18.5, not 20.0"]
+    changes += ["physics.control_dt=0.025, not 0.02"]
     monkeypatch.setattr(evaluation, "HORIZON", 0.2)
     given = ["--levels", "9", "--families", "rough", "--episodes", "1", "--workers", "1"]
     out = tmp_path / "out"

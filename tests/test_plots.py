@@ -97,6 +97,7 @@ def test_success_figure_shows_the_rates(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "summary.json").write_text(json.dumps(table), encoding="utf-8")
     figures = drawn(monkeypatch)
     plots.success_by_level(tmp_path / "summary.json", tmp_path / "one.png")
+    assert len(figures[0].axes) == len(FAMILIES)
     for k, axis in enumerate(figures[0].axes):
         found = {c.get_label(): c.lines[0].get_xydata() for c in axis.containers}
         assert axis.get_title() == FAMILIES[k]

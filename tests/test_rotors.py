@@ -60,9 +60,13 @@ def bullet(
 
 
 def flight(world: BulletWorld) -> Array:
-    """Move all joints at random in the air: joint speeds and the trunk's rates, (12, 15) rad/s."""
+    """Move all joints at random in the air: joint speeds and the trunk's rates, (12, 15) rad/s.
+
+    The robot faces neither axis of the world, so that the frames of torques matter.
+    """
     rng = np.random.default_rng(0)
-    world.reset_robots([0], np.array([[2.0, 2.0, 3.0]]), yaw_quaternion(np.zeros(1)), NOMINAL[None])
+    yaw = yaw_quaternion(np.array([2.0]))
+    world.reset_robots([0], np.array([[2.0, 2.0, 3.0]]), yaw, NOMINAL[None])
     target, rates = NOMINAL, []
     for _ in range(12):
         target = target + rng.normal(0.0, 0.15, 12)

@@ -207,6 +207,14 @@ def test_knows_both_ways_around_what_stands_before_it(course) -> None:
         np.testing.assert_array_equal(course.teacher.dearer, 0.0)
 
 
+def test_knows_a_way_back_for_a_robot_far_off_its_tile(course) -> None:
+    """It may be there at the end of a long decision."""
+    course = course(["pillar"])
+    course.put(-1.0)
+    assert np.isfinite(course.commands()).all()
+    assert np.isfinite(course.teacher.other).all() and np.isfinite(course.teacher.dearer).all()
+
+
 def test_leaps_over_a_trench_once_the_probes_show_it(course) -> None:
     """Wherever it lies: the robot walks until there, leaps, and then walks again."""
     course = course([lambda x, y: trench(x, y) + 0.08 * ((x > 1.8) & (x < 2.5)), trench, "gap"])

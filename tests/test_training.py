@@ -45,6 +45,7 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
+from tdgc.errors import what_stopped
 from tdgc.learn.checkpoints import Checkpoint, CheckpointError
 from tdgc.learn.flags import Machine, _keep_start, add_arguments, configure
 from tdgc.learn.imitation import TaughtPolicy
@@ -310,7 +311,7 @@ def test_time_limit() -> None:
     assert over.due() and over.reason == "the time limit"
     os.kill(os.getpid(), signal.SIGTERM)  # the first signal; the last checkpoint is being written
     assert over.due() and over.reason == "the time limit"
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match=r"^SIGTERM$"):
         os.kill(os.getpid(), signal.SIGTERM)
 
 
@@ -339,8 +340,10 @@ def test_a_signal_asks_to_stop_and_a_second_one_stops(number: signal.Signals) ->
     interruption = Interruption(None)
     os.kill(os.getpid(), number)
     assert interruption.due() and interruption.reason == number.name
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt) as stopped:
         os.kill(os.getpid(), number)
+    said = {signal.SIGINT: "stopped by Ctrl-C", signal.SIGTERM: "stopped by SIGTERM"}
+    assert what_stopped(stopped.value) == said[number]
 
 
 # ------------------------------------------------------------------ the policy that is trained
@@ -502,11 +505,15 @@ def test_a_stopped_killed_and_resumed_run_ends_as_one_that_never_stopped(
     assert final(broken) == final(whole)
     assert policies.load(whole / "policy").meta["calibration"] == {"robots": 0}
 
-    # Resuming a finished run changes nothing.
+    # Resuming a finished run changes nothing, and it says so.
+    capfd.readouterr()
     assert train_low.main(["--resume", "--out", str(broken)]) == 0
+    said = "has been trained for 160 steps already; only a larger --steps would train it further"
+    assert f"{broken} {said}\n" in capfd.readouterr().out
     assert final(broken) == final(whole)
 
 
+@pytest.mark.usefixtures("inline_workers")
 def test_a_killed_and_resumed_high_level_ends_as_one_that_never_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -622,6 +629,24 @@ def test_the_manner_of_the_teacher(
     ]
 
 
+@pytest.mark.usefixtures("inline_workers")
+def test_the_imitating_policy_is_kept_when_nothing_comes_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run of imitation alone may be continued with reinforcement learning."""
+    monkeypatch.chdir(ROOT)
+    arguments = [
+        "--seed", "3", "--n-envs", "2", "--workers", "1", "--steps", "8", "--set", "ppo.n_steps=4",
+        "--set", "ppo.minibatches=2", "--set", "imitation.minibatches=2", "--set", "ppo.n_epochs=1",
+        "--set", "ppo.lstm=8", "--set", "ppo.actor=[8]", "--set", "ppo.critic=[8]",
+        "--set", "imitation.teacher.walk_speed=0.6", "--set", 'env.families=["rough"]',
+    ]  # fmt: skip
+    assert train_high.main([*arguments, "--out", str(tmp_path)]) == 0
+    imitated = (tmp_path / "imitation.safetensors").read_bytes()
+    assert weights(tmp_path) == imitated
+
+
+@pytest.mark.usefixtures("inline_workers")
 def test_from_scratch_on_terrain_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -748,6 +773,28 @@ def test_calibration_ends_a_run_of_the_low_policy(
     assert said in "".join(capfd.readouterr())
 
 
+@pytest.mark.usefixtures("inline_workers")
+def test_a_policy_that_diverges_ends_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The checkpoint from before the update stays, and the run resumes from it."""
+    update = PPO.train
+
+    def diverge(model: PPO) -> None:
+        update(model)
+        if model.num_timesteps == 96:
+            next(model.policy.parameters()).data[0] = np.nan
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PPO, "train", diverge)
+        assert train_low.main([*TINY, "--out", str(tmp_path)]) == 1
+    said = "the policy diverged at 96 steps; --resume continues from the last checkpoint"
+    assert f"train_low.py: {said}" in capsys.readouterr().err
+    assert Checkpoint.read(newest(tmp_path)).steps == 64
+    assert train_low.main(["--resume", "--out", str(tmp_path)]) == 0
+    assert policies.load(tmp_path / "policy").meta["steps"] == 160
+
+
 def test_faults_of_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -853,6 +900,10 @@ def test_flags_and_folders_that_cannot_be_used(
             "env.command_seconds=0.005",
         ],
         "'plane_share' must be from 0 to below 1, not 1": ["--set", "plane_share=1"],
+        "'env.randomisation.probe_delay' has no effect": [
+            "--set",
+            "env.randomisation.probe_delay=0",
+        ],
         "below which a robot has fallen, not 0.14": ["--set", "env.robot.base_height=0.17"],
         "'calibration.robots' must be 0 or at least 64": ["--set", "calibration.robots=63"],
         "--worker-timeout must be above 0 and at most 86400, not inf": ["--worker-timeout", "inf"],
@@ -1089,7 +1140,7 @@ def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """``auto`` is one worker per core, with at least 10 robots each.
 
-    A resumed run keeps its number of workers, unless a flag gives another.
+    A resumed run keeps its number of workers, and ``--set`` has its way, as with other flags.
     """
     parser = argparse.ArgumentParser()
     add_arguments(parser, str(tmp_path), LowTrainConfig(), "control steps")
@@ -1102,10 +1153,41 @@ def test_workers_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert workers() == workers("--set", "workers=2") == 2
     assert workers("--workers", "auto") == 3
     assert workers("--workers", "auto", "--n-envs", "25") == 2
+    assert workers("--workers", "auto", "--set", "workers=1") == 1
     begun = json.dumps(to_dict(LowTrainConfig(workers=7)))
     (tmp_path / "config.json").write_text(begun, encoding="utf-8")
     assert workers("--resume", "--workers", "auto") == workers("--resume") == 7
-    assert workers("--resume", "--workers", "5") == 5
+    for name, given, kept in (("workers", "5", 7), ("n-envs", "60", 120)):
+        setting = name.replace("-", "_")
+        with pytest.raises(ConfigError, match=f"^--resume keeps the run's {setting}, {kept}: no "):
+            workers("--resume", f"--{name}", given)
+
+
+@pytest.mark.parametrize(
+    ("before", "flag", "message"),
+    [
+        ((), "ppo.desired_kl=0.01", "ppo.desired_kl from None to 0.01"),
+        ((), "ppo.gait_hold=5", "ppo.gait_hold from 1 to 5"),
+        (("ppo.desired_kl=0.01",), "ppo.desired_kl=null", "ppo.desired_kl from 0.01 to None"),
+        (("ppo.gait_hold=5",), "ppo.gait_hold=1", "ppo.gait_hold from 5 to 1"),
+        (("ppo.gait_hold=5", "ppo.desired_kl=0.01"), "ppo.gait_hold=9", None),
+        (("ppo.gait_hold=5", "ppo.desired_kl=0.01"), "ppo.desired_kl=0.02", None),
+    ],
+)
+def test_a_resumed_run_cannot_switch_what_is_kept_with_its_policy(
+    before: tuple[str, ...], flag: str, message: str | None, tmp_path: Path
+) -> None:
+    begun = to_dict(with_overrides(HighTrainConfig(), before))
+    (tmp_path / "config.json").write_text(json.dumps(begun), encoding="utf-8")
+    parser = argparse.ArgumentParser()
+    add_arguments(parser, str(tmp_path), HighTrainConfig(), "decisions")
+    args = parser.parse_args(["--resume", "--set", flag])
+    if message is None:
+        changed = with_overrides(HighTrainConfig(), (*before, flag))
+        assert configure(HighTrainConfig(), args) == changed
+    else:
+        with pytest.raises(ConfigError, match=f"^--resume cannot change {re.escape(message)}$"):
+            configure(HighTrainConfig(), args)
 
 
 def test_the_low_policy_is_what_the_first_command_left(

@@ -266,7 +266,11 @@ VALUES = st.recursive(
 )
 
 
-@settings(deadline=None)
+#: The same examples in every run.
+examples = settings(deadline=None, derandomize=True, database=None)
+
+
+@examples
 @given(st.dictionaries(KEYS, VALUES, max_size=3), st.lists(st.text(max_size=12), max_size=2))
 def test_anything_else_is_a_tuning_or_one_line(tmp_path_factory, data, texts):
     path = tmp_path_factory.mktemp("fuzz") / "tuning.json"
@@ -274,15 +278,23 @@ def test_anything_else_is_a_tuning_or_one_line(tmp_path_factory, data, texts):
     keys = ["decoder.vx.high=", "decision_rate=", "decoder.gaits=", ""]
     assignments = [key + text for key, text in zip(keys, texts, strict=False)]
     try:
-        found = load(path, assignments)
-        check(found, HIGH, LOW)
+        check(load(path, assignments), HIGH, LOW)
     except ConfigError as error:
         assert len(str(error).splitlines()) == 1
+
+
+@examples
+@given(st.sampled_from(CONTINUOUS), st.floats(-0.5, 1.5), st.floats(-0.5, 1.5))
+def test_bounds_narrow_the_ranges_or_are_refused(name, share, other):
+    (low, high) = getattr(LOW.commands, name)
+    bottom, top = low + share * (high - low), low + other * (high - low)
+    tuning = Tuning(DecoderTuning(**{name: Limits(bottom, top)}))
+    if low <= bottom <= top <= high:
+        ranges = tuned_ranges(tuning, HIGH, LOW)
+        assert ranges == dataclasses.replace(LOW.commands, **{name: (bottom, top)})
     else:
-        ranges = tuned_ranges(found, HIGH, LOW)
-        for name in CONTINUOUS:
-            (low, high), (bottom, top) = getattr(LOW.commands, name), getattr(ranges, name)
-            assert low <= bottom <= top <= high
+        with pytest.raises(ConfigError, match=rf"^decoder\.{name}[.:]"):
+            tuned_ranges(tuning, HIGH, LOW)
 
 
 # ------------------------------------------------------------------ beside the untuned run

@@ -169,7 +169,7 @@ def test_reset_begins_all_returns_anew(counters: TaskVecEnv) -> None:
 def test_statistics_and_states_of_each_worker(counters: TaskVecEnv) -> None:
     stats = counters.stats()
     assert [s["robots"] for s in stats] == [2.0, 3.0]
-    assert all(10.0 < s["memory_mb"] < 1000.0 for s in stats)  # little more than numpy
+    assert all(10.0 < s["memory_mb"] < 120.0 for s in stats)  # with PyTorch it would be 174
     states = counters.state_dicts()
     assert [s["seed"] for s in states] == [worker_seed(3, 0), worker_seed(3, 1)]
     assert [s["restarts"] for s in states] == [0, 0]

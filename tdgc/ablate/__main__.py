@@ -41,8 +41,14 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m tdgc.ablate", description=(__doc__ or "").partition("\n")[0]
     )
-    names = ", ".join(variant.name for variant in variants(False))
-    parser.add_argument("--only", metavar="NAMES", help=f"comma-separated, of {names} (all)")
+    taught, alone = (
+        ", ".join(variant.name for variant in variants(alone)) for alone in (False, True)
+    )
+    parser.add_argument(
+        "--only",
+        metavar="NAMES",
+        help=f"comma-separated, of {taught}; with --no-teacher of {alone} (all)",
+    )
     parser.add_argument("--seeds", default="42", help="training seeds, e.g. 42,43 (42)")
     parser.add_argument("--steps", type=int, help="decisions per training (as train_high.py)")
     parser.add_argument("--levels", default="6-10", help="levels to evaluate (6-10)")
@@ -107,18 +113,25 @@ def check_trainings(runner: Runner, chosen: Sequence[Variant], seeds: Sequence[i
         with_overrides(HighTrainConfig(), runner.training_settings(variant))
 
 
-def without_missing(chosen: Sequence[Variant], low: Path) -> list[Variant]:
-    """Leave out what needs a low policy without its correction if it has none.
+def without_missing(chosen: Sequence[Variant], low: Path, settings: Sequence[str]) -> list[Variant]:
+    """Leave out what needs a low policy without its correction if it has none, and the policy
+    right after imitation if the ``settings`` of all trainings leave imitation out.
 
     Raises:
         ConfigError: the low policy cannot be used.
     """
-    if load_low(low)[0].correction is not None:
-        return list(chosen)
-    left_out = [variant.name for variant in chosen if variant.low == "uncalibrated"]
-    if left_out:
-        print(f"{' and '.join(left_out)} left out: '{low}' has no correction")
-    return [variant for variant in chosen if variant.low != "uncalibrated"]
+    missing = []
+    if load_low(low)[0].correction is None:
+        missing.append(("uncalibrated", f"'{low}' has no correction"))
+    if not with_overrides(HighTrainConfig(), settings).imitation.steps:
+        missing.append(("imitation", "nothing is imitated"))
+    kept = list(chosen)
+    for what, why in missing:
+        left_out = [variant for variant in kept if what in (variant.low, variant.high)]
+        if left_out:
+            print(f"{' and '.join(variant.name for variant in left_out)} left out: {why}")
+        kept = [variant for variant in kept if variant not in left_out]
+    return kept
 
 
 def plan(chosen: Sequence[Variant], seeds: Sequence[int]) -> list[Trial]:
@@ -237,7 +250,7 @@ def main(arguments: list[str] | None = None) -> int:
     chosen, seeds = choose(args.only, variants(args.no_teacher)), choose_seeds(args.seeds)
     check_trainings(runner, chosen, seeds)
     if args.only is None:
-        chosen = without_missing(chosen, args.low)
+        chosen = without_missing(chosen, args.low, runner.settings)
     tiles, trials = runner.tiles(), plan(chosen, seeds)
     common = claim(runner, tiles)
     with sole_user(args.out):

@@ -24,7 +24,7 @@ from tdgc.ablate.variants import WHOLE, Variant
 from tdgc.config import HighTrainConfig, read_json, with_overrides
 from tdgc.errors import FAILURES, InputError, StoppedError, escaped, what_stopped
 from tdgc.files import read_csv, write_json
-from tdgc.learn.run import signals_restored
+from tdgc.learn.run import signalled, signals_restored
 from tdgc.parallel.cores import Workers
 from tdgc.policies.acting import without_correction
 from tdgc.sim.families import UNNAMED
@@ -199,6 +199,8 @@ class Runner:
         flags += [] if left is None else ["--time-limit", left]
         with signals_restored():
             call(train_high.main, [*flags, "--out", folder])
+            if signalled():  # perhaps after the last update, when the training ended anyway
+                raise StoppedError
         budget = _number(read_json(folder / "config.json"), "steps", folder / "config.json")
         meta = policies.load(folder / "policy").meta
         if _number(meta, "steps", folder / "policy.json") < budget:

@@ -93,7 +93,7 @@ VARIANTS: tuple[Variant, ...] = (
 #: Rows for trainings with a teacher, next to each other: without one, robots are on the benchmark's
 #: families alone, and every robot is told its family.
 WITH_TEACHER = ("no-clutter", "no-exchange", "no-teacher", "imitation")
-#: Rows in their place with ``--no-teacher``: each undoes one setting that helps such a training.
+#: Rows in their place with ``--no-teacher``: each changes one setting that helps such a training.
 HELPS: tuple[Variant, ...] = (
     Variant("gait-per-decision", "noise of the gait not held", ("ppo.gait_hold=1",)),
     Variant("gait-per-episode", "noise of the gait held for 20 s", ("ppo.gait_hold=200",)),

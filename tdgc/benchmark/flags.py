@@ -118,7 +118,7 @@ def choose_levels(text: str) -> tuple[int, ...]:
             raise ValueError(f"cannot read --levels '{text}'; write e.g. 6-10 or 0,5,10") from error
     top = OOD_LEVELS[-1]
     if not all(span and span[0] >= 0 and span[-1] <= top for span in spans):
-        raise ValueError(f"--levels '{text}' must name levels from 0 to {top}")
+        raise ValueError(f"--levels '{text}' must name levels from 0 to {top}, upwards")
     levels = [level for span in spans for level in span]
     if len(set(levels)) < len(levels):
         raise ValueError(f"--levels '{text}' names a level twice")

@@ -176,7 +176,7 @@ def with_overrides(config: Config, assignments: Iterable[str]) -> Config:
     for text in assignments:
         key, equals, raw = text.partition("=")
         if not equals or not key:
-            raise ConfigError(f"cannot read --set '{text}'; write key=value, e.g. kp=25")
+            raise ConfigError(f"cannot read --set '{text}'; write key=value, e.g. a.b=0.5")
         try:
             value = json.loads(raw)
         except (ValueError, RecursionError):

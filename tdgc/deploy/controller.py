@@ -28,7 +28,7 @@ Run = Callable[[list[Array]], list[Array]]
 
 
 class Graph:
-    """A graph and its interface file, run on one thread as a robot would run it.
+    """A graph and its interface file, run as a robot would run it; ONNX Runtime uses one thread.
 
     Args:
         folder: folder that ``tdgc.export`` wrote.

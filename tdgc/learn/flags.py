@@ -24,13 +24,16 @@ from tdgc.parallel.worker import MakeLink, ProcessLink
 _LONGEST = 86400.0  # s, of a worker's silence: one day; waiting on a pipe overflows at 25 days
 TrainConfig = TypeVar("TrainConfig", LowTrainConfig, HighTrainConfig)
 _TRAINERS = {LowTrainConfig: "train_low.py", HighTrainConfig: "train_high.py"}
-#: Settings that a resumed run cannot change: they act when a run begins, or shape the ground, on
-#: which episodes are under way.
+#: Settings that a resumed run cannot change: they act when a run begins, or shape its workers or
+#: the ground, on which episodes are under way.
 _AT_START = (
-    "seed", "start_speed", "start_swing", "ppo.initial_std", "ppo.initial_gait_std",
-    "env.first_level", "env.first_levels", "env.command_start", "env.families",
-    "env.shallowest_trench", "env.crossing.shallowest_trench",
+    "seed", "n_envs", "workers", "start_speed", "start_swing", "ppo.initial_std",
+    "ppo.initial_gait_std", "env.first_level", "env.first_levels", "env.command_start",
+    "env.families", "env.shallowest_trench", "env.crossing.shallowest_trench",
 )  # fmt: skip
+#: Settings that it can change, but not switch on or off, and their values that are off: what they
+#: need is kept with the policy.
+_SWITCHES = {"ppo.desired_kl": None, "ppo.gait_hold": 1}
 
 
 class Machine(NamedTuple):
@@ -139,7 +142,9 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
     if args.resume:
         _keep_start(to_dict(before), to_dict(config))
     cores = usable_cores() if args.cluster is None else connect(args.cluster)
-    if args.workers == "auto" and not args.resume:  # a resumed run keeps its number of workers
+    own = any(text.partition("=")[0].strip() == "workers" for text in args.assignments)
+    # A resumed run keeps its number of workers.
+    if args.workers == "auto" and not args.resume and not own:
         workers = auto_workers(config.n_envs, cores)
         config = with_overrides(config, [f"workers={workers}"])
     if args.cluster is not None:
@@ -150,7 +155,7 @@ def configure(config: TrainConfig, args: argparse.Namespace) -> TrainConfig:
 
 
 def _keep_start(before: Any, now: Any) -> None:
-    """Check that a resumed run does not change a setting of ``_AT_START``.
+    """Check that a resumed run does not change a setting of ``_AT_START`` or ``_SWITCHES``.
 
     Raises:
         ConfigError: names the setting and its value.
@@ -159,6 +164,10 @@ def _keep_start(before: Any, now: Any) -> None:
         then, new = (_setting(name.split("."), table) for table in (before, now))
         if then != new:
             raise ConfigError(f"--resume keeps the run's {name}, {then}: no other {name}")
+    for name, off in _SWITCHES.items():
+        then, new = (_setting(name.split("."), table) for table in (before, now))
+        if (then == off) != (new == off):
+            raise ConfigError(f"--resume cannot change {name} from {then} to {new}")
 
 
 def _setting(path: list[str], table: Any) -> Any:

@@ -65,19 +65,24 @@ class Phase:
 
 
 class Interruption:
-    """Turns SIGINT, SIGTERM and a time limit into one flag that the learning loop checks."""
+    """Turns SIGINT, SIGTERM and a time limit into one flag that the learning loop checks.
+
+    Attributes:
+        reason: why to stop; None for no reason.
+        signalled: whether a signal came.
+    """
 
     def __init__(self, time_limit: float | None) -> None:
         self.reason: str | None = None
-        self._signalled = False
+        self.signalled = False
         self._deadline = math.inf if time_limit is None else time.monotonic() + time_limit
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._signalled:  # asked twice: stop at once
-            raise KeyboardInterrupt
-        self._signalled = True
+        if self.signalled:  # asked twice: stop at once
+            raise KeyboardInterrupt("SIGTERM" if number == signal.SIGTERM else "")
+        self.signalled = True
         if self.reason is None:
             self.reason = signal.Signals(number).name
 
@@ -90,6 +95,12 @@ class Interruption:
     def tell(self, run: Path) -> None:
         """Print what stopped the run in the folder ``run`` and how to resume it."""
         tqdm.write(f"stopped by {self.reason}; continue with --resume --out {run}")
+
+
+def signalled() -> bool:
+    """Whether a signal came that this process's latest ``Interruption`` has turned into a flag."""
+    latest = getattr(signal.getsignal(signal.SIGINT), "__self__", None)
+    return isinstance(latest, Interruption) and latest.signalled
 
 
 @contextlib.contextmanager
@@ -135,6 +146,7 @@ class Run:
             InputError: another process trains in the folder.
             CheckpointError: there is no readable checkpoint to resume from, or it does not fit.
             ValueError: the policy ``init`` cannot be read or does not fit.
+            FloatingPointError: the policy diverged; the last checkpoint is from before.
             WorkerError: too many worker faults; a checkpoint was written.
             OSError: a file cannot be written, for example the last checkpoint.
             Exception: what ``finish`` raises.
@@ -144,9 +156,14 @@ class Run:
         finished, unsaved = True, None
         with sole_user(self.folder):
             last = Checkpoint.newest(self.folder, tqdm.write) if resume else None
+            if last is not None and last.steps >= phases[-1].until:
+                tqdm.write(
+                    f"{self.folder} has been trained for {last.steps} steps already; only a larger "
+                    "--steps would train it further"
+                )
             for phase in phases:
                 if finished and (last is None or last.steps < phase.until):
-                    last, finished, unsaved = self._go_through(phase, last)
+                    last, finished, unsaved = self._go_through(phase, last, phase is phases[-1])
             if unsaved is not None:
                 raise unsaved
             if finished:
@@ -170,9 +187,11 @@ class Run:
             tqdm.write(f"{self.init} was trained with {change}")
 
     def _go_through(
-        self, phase: Phase, last: Checkpoint | None
+        self, phase: Phase, last: Checkpoint | None, final: bool
     ) -> tuple[Checkpoint, bool, OSError | None]:
         """Run one phase from the checkpoint ``last``, or from the start of the run if None.
+
+        The policy at its end is kept beside those of later phases, unless it is the ``final`` one.
 
         Returns:
             The checkpoint at its end; whether the phase finished; and the error if that checkpoint
@@ -210,8 +229,7 @@ class Run:
                 callback.log()
                 callback.save()
                 raise
-            # A phase's policy is kept beside those of later phases.
-            keeps = finished and phase.until < self.config.steps
+            keeps = finished and not final
             taken = callback.save(("policy", phase.name) if keeps else ("policy",))
             if keeps and callback.unsaved is not None:
                 raise callback.unsaved  # later phases would not write this phase's policy
@@ -434,6 +452,7 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
     written then is complete.
 
     Raises:
+        FloatingPointError: an update left a parameter that is not finite.
         WorkerError: too many worker faults; parameters and step count are those after the last
             update.
     """
@@ -446,6 +465,11 @@ def learn(model: Any, callback: RunCallback, until: int) -> bool:
             model._update_current_progress_remaining(model.num_timesteps, until)
             model.train()
             updated_at = model.num_timesteps
+            if not all(p.isfinite().all() for p in model.policy.parameters()):
+                raise FloatingPointError(
+                    f"the policy diverged at {updated_at} steps; --resume continues from the last "
+                    "checkpoint, perhaps with a lower --set ppo.learning_rate"
+                )
         callback.log()
     except WorkerError:
         # Nothing was learned from the steps since.

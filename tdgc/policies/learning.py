@@ -205,7 +205,7 @@ class AsymmetricActorCriticPolicy(ActorCriticPolicy):
 
     The critic can see what the robot cannot sense (friction, true velocity, payload); the actor
     sees only the first ``actor_dim`` entries. All other arguments of SB3's ``ActorCriticPolicy``
-    are accepted, too; ``net_arch`` and ``activation_fn`` have different defaults here.
+    but ``use_sde`` can be used; ``net_arch`` and ``activation_fn`` have different defaults here.
 
     With a ``mirror``, the policy and its value are exactly left-right symmetric.
 

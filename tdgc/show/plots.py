@@ -353,7 +353,7 @@ def _draw_command(
     # A command holds for the whole control step at whose end it was recorded.
     axis.stairs(command, np.append(0.0, ends), baseline=None, color="black", linewidth=1.2)
     bottom, top = min(map(np.min, seen)), max(map(np.max, seen))
-    margin = 0.12 * (top - bottom)
+    margin = 0.12 * (top - bottom) or 0.1  # a pinned command has one value only
     axis.set_ylim(bottom - margin, top + margin)
     axis.yaxis.set_major_locator(MaxNLocator(2 if measured is None else 4))
 

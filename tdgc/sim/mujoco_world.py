@@ -287,17 +287,18 @@ class Window(contextlib.ExitStack):
 
         world = batch.loco.world
         assert isinstance(world, MujocoWorld)
-        self._dt, self._due = world.physics.control_dt, time.perf_counter()
+        self._dt = world.physics.control_dt
         opened = viewer.launch_passive(
             world.model, world.data, show_left_ui=False, show_right_ui=False
         )
         self._shown = self.enter_context(opened)
         self._shown.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         self._shown.cam.trackbodyid, self._shown.cam.distance = 1, 2.0
+        self._due = time.perf_counter()
 
     def step(self, step: int, live: NDArray[np.intp]) -> None:
         if not self._shown.is_running():
             raise WindowError("the window was closed")
         self._shown.sync()
-        self._due += self._dt
+        self._due = max(self._due + self._dt, time.perf_counter())  # delays are not made up
         time.sleep(max(0.0, self._due - time.perf_counter()))

@@ -60,7 +60,7 @@ class HighSources(NamedTuple):
         time_share: (M,) t / T_max.
         last_action: (M, 13), normalised.
         families: (M,) indices into ``SEMANTIC``.
-        probes: (M, 32) m, from ``HeightProbes.read`` or ``height_probes``.
+        probes: (M, 32) m, from ``HeightProbes.read``.
         late: (M,) how many decisions ago the probes were measured.
         closing: (M,) m/s, speed towards the goal since the last decision.
     """

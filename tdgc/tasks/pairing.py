@@ -14,6 +14,8 @@ from tdgc.sim.commands import (
     CommandDecoder,
     default_command,
 )
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import width
 from tdgc.sim.robot import NUM_JOINTS
 
 #: Folder of the shipped policies.
@@ -52,14 +54,21 @@ def mdp_of(low: Policy, source: object = "the low policy") -> LowLevelConfig:
     """The MDP that a low policy was trained on.
 
     Raises:
-        ConfigError: it is not a low policy; the message begins with ``source``.
+        ConfigError: it is not a low policy, or not one of the MDP that it names; the message begins
+            with ``source``.
     """
     if low.kind != "mlp" or low.action_dim != NUM_JOINTS or "config" not in low.meta:
         raise ConfigError(f"{source}: not a low policy of this package")
     sizes = low.header.correction
     if sizes and (sizes[0], sizes[-1]) != (NUM_COMMANDS, 3):
         raise ConfigError(f"{source}: its correction is not one of the {NUM_COMMANDS} commands")
-    return recorded(LowLevelConfig, low.meta["config"], source)
+    config = recorded(LowLevelConfig, low.meta["config"], source)
+    size = width(actor_layout(config.robot, config.gyro))
+    if low.actor_dim != size:
+        raise ConfigError(
+            f"{source}: its configuration gives {size} observations, it takes {low.actor_dim}"
+        )
+    return config
 
 
 def load_low(path: str | Path) -> tuple[Policy, LowLevelConfig]:

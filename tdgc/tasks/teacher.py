@@ -305,7 +305,9 @@ def _ways(cost: Array, left: float, at: Array, ahead: float) -> tuple[float, flo
 
     x, y = at[0] + LOOK * np.cos(_RAYS), at[1] + LOOK * np.sin(_RAYS)
     value = to_go(x, y) + 0.01 * np.abs(wrap_angle(_RAYS - ahead))
-    value[(x < 0.0) | (x > TILE_SIZE)] = np.inf
+    outside = (x < 0.0) | (x > TILE_SIZE)
+    if not outside.all():  # nothing is left to compare for a robot that has left its tile
+        value[outside] = np.inf
     first = value.argmin()
     least = (value <= np.roll(value, 1)) & (value <= np.roll(value, -1)) & (value < to_go(*at))
     apart = np.abs(wrap_angle(_RAYS - _RAYS[first])) > _APART

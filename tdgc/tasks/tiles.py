@@ -88,7 +88,7 @@ class TrainingTiles:
 
     def draw(self, index: NDArray[np.integer], levels: NDArray[np.integer]) -> NDArray[np.integer]:
         """Draw new tiles for the robots ``index`` (n,) at their ``levels`` (M,). Returns the robots
-        whose heights changed: some families have only one tile per level."""
+        whose heights changed: a height map is one tile on every level."""
         index = index[self._relief[index]]
         self.number[index] = self.drawn + np.arange(len(index))
         self.drawn += len(index)
