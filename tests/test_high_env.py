@@ -13,6 +13,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from test_drivers import put_before_trenches
 
 import tdgc  # noqa: F401  registers the environments
+from tdgc import policies
 from tdgc.config import (
     NO_TEACHER,
     ConfigError,
@@ -21,6 +22,7 @@ from tdgc.config import (
     HighTrainConfig,
     LowLevelConfig,
     RobotConfig,
+    to_dict,
     with_overrides,
 )
 from tdgc.sim.bullet_world import BulletWorld
@@ -632,6 +634,22 @@ def test_gymnasium_and_sb3_accept_it():
     try:
         check_env(env.unwrapped, skip_render_check=True)
         sb3_check_env(env.unwrapped)
+    finally:
+        env.close()
+
+
+def test_a_given_low_policy_is_rendered(tmp_path):
+    """Its robot stands on the tile, which is not all that can be seen."""
+    half = dataclasses.replace(LOW_CONFIG.robot, action_limit=0.5)
+    meta = {"config": to_dict(dataclasses.replace(LOW_CONFIG, robot=half))}
+    policies.save_copy(tmp_path / "low", LOW_POLICY, meta)
+    low = str(tmp_path / "low")
+    env = gym.make("tdgc/Navigation-v0", low=low, render_mode="rgb_array")
+    try:
+        env.reset(seed=0)
+        assert env.unwrapped.task.locomotion.robot.action_limit == 0.5
+        picture = env.render()
+        assert picture.shape == (400, 640, 3) and picture.std() > 10.0
     finally:
         env.close()
 

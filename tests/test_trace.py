@@ -425,6 +425,7 @@ def test_the_script_writes_what_was_asked_for(tmp_path, capsys):
     # Fewer traces in the same folder: the old ones are removed.
     assert evaluate.main([*flags, "--trace", "1"]) == 0
     assert [p.name for p in (tmp_path / "traces").iterdir()] == ["gp_nominal_gap_10_000.parquet"]
+    assert read_csv(tmp_path / "diagnosis.csv") == diagnosed  # of all failures, as before
     # Without traces the table is the same, and no stale diagnosis or trace remains.
     before = (tmp_path / "episodes.csv").read_bytes()
     assert evaluate.main(flags) == 0

@@ -1016,11 +1016,12 @@ def test_a_run_that_cannot_begin_leaves_its_folder_free(
     assert not (tmp_path / "run" / "config.json").exists()
 
 
-#: A run of train_high.py that stops at its beginning.
-UNTRAINED = [
+#: A run of train_high.py that stops at its beginning; one without imitation.
+STOPPED = [
     "--n-envs", "4", "--workers", "1", "--set", "ppo.lstm=8", "--set", "ppo.minibatches=4",
-    "--set", "imitation.steps=0", "--time-limit", "0",
+    "--time-limit", "0",
 ]  # fmt: skip
+UNTRAINED = [*STOPPED, "--set", "imitation.steps=0"]
 
 
 @pytest.mark.usefixtures("inline_workers")
@@ -1067,13 +1068,13 @@ def test_the_apprentice_sees_all_levels_and_is_led_for_three_quarters(
 def test_a_start_from_a_policy_of_other_settings_names_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = ["--n-envs", "4", "--workers", "1", "--set", "ppo.lstm=8", "--set", "ppo.minibatches=4"]
-    small += ["--set", "imitation.steps=0", "--time-limit", "0"]
     first, slower = tmp_path / "first", tmp_path / "slower"
     assert train_high.main([*UNTRAINED, "--out", str(first)]) == 0
     begin = ["--init", str(first / "policy"), "--set", "env.commands.vx=[-1,0.8]"]
-    assert train_high.main([*UNTRAINED, *begin, "--seed", "7", "--out", str(slower)]) == 0
+    assert train_high.main([*STOPPED, *begin, "--seed", "7", "--out", str(slower)]) == 0
     assert weights(slower) == weights(first)
+    stored = json.loads((slower / "config.json").read_text(encoding="utf-8"))
+    assert stored["imitation"]["steps"] == 0  # it would overwrite what the policy has learned
     fresh = tmp_path / "fresh"
     assert train_high.main([*UNTRAINED, "--seed", "7", "--out", str(fresh)]) == 0
     assert weights(fresh) != weights(first)
@@ -1083,12 +1084,20 @@ def test_a_start_from_a_policy_of_other_settings_names_them(
 
 
 @pytest.mark.usefixtures("inline_workers")
+def test_a_low_policy_can_start_from_another(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    untrained = [*TINY, "--time-limit", "0"]
+    assert train_low.main([*untrained, "--out", str(first)]) == 0
+    begin = ["--init", str(first / "policy"), "--seed", "7"]
+    assert train_low.main([*untrained, *begin, "--out", str(second)]) == 0
+    assert weights(second) == weights(first)
+
+
+@pytest.mark.usefixtures("inline_workers")
 def test_a_start_from_a_policy_for_another_robot_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Also if the policy's file does not say what it was trained with."""
-    small = ["--n-envs", "4", "--workers", "1", "--set", "ppo.lstm=8", "--set", "ppo.minibatches=4"]
-    small += ["--set", "imitation.steps=0", "--time-limit", "0"]
     assert train_high.main([*UNTRAINED, "--out", str(tmp_path / "first")]) == 0
     first, said = policies.load(tmp_path / "first/policy"), []
     stiff = copy.deepcopy(first.meta)

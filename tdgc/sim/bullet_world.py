@@ -35,12 +35,14 @@ _GROUND, _ROBOT = 1, 2  # collision groups: robots collide with the ground only
 _TRUNK = -1  # Bullet's index of a body's root link
 _PARKED = 50.0  # m, lift that clears all terrain, which stays within HEIGHT_RANGE
 _SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out
-_TOUCHES = 0.0005  # m: a calf this close to the ground is in contact, even if it does not press
+# m, chosen by hand: a calf this close to the ground is in contact, even if it does not press.
+_TOUCHES = 0.0005
 #: rad/s^2: a leg in contact is not held against what rotors give back if that is less than this
 #: times J. Then feet that meet a riser at less than 0.4 m/s bounce back; half of it would halve
 #: that speed, but twice as many legs would be looked up.
 _FELT = 500.0
-_FOOT_REACH = 0.03  # m beyond the foot's radius: nearer calf contacts are the foot's
+# m beyond the foot's radius, chosen by hand: nearer calf contacts are the foot's.
+_FOOT_REACH = 0.03
 
 
 def _load() -> Any:

@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 NUM_JOINTS = len(JOINTS)
 
 GRAVITY = 9.81  # m/s^2
-HIGHEST_FOOT = -0.1  # m relative to the hips: no commanded pose folds a leg further
+# m relative to the hips, chosen by hand: no commanded pose folds a leg further.
+HIGHEST_FOOT = -0.1
 
 
 def nominal_pose(config: RobotConfig) -> Array:
@@ -251,7 +252,8 @@ def target_limits(config: RobotConfig, geometry: Geometry) -> tuple[Array, Array
     return low + config.joint_margin, high - config.joint_margin
 
 
-FRICTION_SPEED = 1.0  # rad/s from which dry friction is full; a jump at 0 would chatter
+# rad/s from which dry friction is full, chosen by hand; a jump at 0 would chatter.
+FRICTION_SPEED = 1.0
 
 
 def pd_torque(
@@ -373,7 +375,7 @@ def wrap_angle(angle: Array) -> Array:
     return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
-CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact
+CONTACT_FORCE = 1.0  # N: a foot that presses harder is in contact, as in legged_gym
 
 
 @dataclass

@@ -69,7 +69,7 @@ FREQUENCIES, LENGTHS = 25, 11
 _RISE, _REACHED = 0.3, 0.95  # time constant in s; share of the commanded speed that is reached
 # Choices about as good as the best are averaged: the price that reduces a choice's weight by a
 # factor of e, and how many Hz and m it may be from the best, so that a short leap is never averaged
-# with a long one.
+# with a long one. Chosen by hand.
 _TEMPERATURE, _NEAR = 0.05, (0.35, 0.03)
 # m: with legs of 0.4 m, a foot can only land further from its foothold if the robot has blown up.
 _REACH = 1.0

@@ -25,8 +25,9 @@ from tdgc.tasks.teacher import Skill
 WALKS = ((0.75, 2.8), (0.9, 3.3))
 #: m/s, speeds of leaps that are tried besides the usual one.
 LEAPS = (1.1, 1.0)
+#: Of each trial. By chance, 40 of 48 vary by 2.6 (standard deviation).
 ROBOTS = 48
-_FIRST = 5  # lowest level; the robots are dealt to it and to those above it
+_FIRST = 5  # lowest level, the middle one; the robots are dealt to it and to those above it
 _SEED = 0
 # How many more of the robots must arrive for a manner to be preferred to one that is nearer to the
 # usual, so that near ties, which another machine may decide differently, change nothing.

@@ -12,6 +12,7 @@ LOOK = 0.35
 RADIUS = 0.28
 # Cost per metre inside the radius and at its edge; 1 in the open. The way straight across an
 # obstacle, at least 0.56 m, then costs more than 16 m in the open, two lengths of a tile.
+# The second was chosen by hand.
 _BLOCKED, _CLOSE = 30.0, 3.0
 _AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 

@@ -27,18 +27,19 @@ _LOW_STEP = 0.1
 _STEP_PRICE, _BESIDE = 6.0, 0.25
 #: m, widest trench to leap over, from lip to lip: strides are up to ``leaps.LONGEST``, 0.48 m.
 WIDEST = 0.45
-_WIDE = 0.55  # m from an obstacle, beyond which it adds no cost
+_WIDE = 0.55  # m from an obstacle, chosen by hand: beyond this it adds no cost
 # m from the middle of the tile to both sides: starts and goals lie within ``Y_SPREAD``, and the
 # rest is about the reach of an obstacle. What is outside is not in the way.
 _CORRIDOR = Y_SPREAD + 0.6
 _COARSE = 2
 #: m, spacing of travel costs: every second sample.
 GRID = _COARSE * CELL
-# Tangent of the least slope that counts, and m: the ground within 0.5 m may deviate from its mean
-# by so much times the slope. On Tilt it deviates by up to 0.2 m times the slope, on Rough by at
-# least 0.8 m.
+# Tangent of the least slope that counts, chosen by hand, and m: the ground within 0.5 m may deviate
+# from its mean by so much times the slope. On Tilt it deviates by up to 0.2 m times the slope, on
+# Rough by at least 0.8 m.
 _LEAST_SLOPE, _UNEVEN = 0.04, 0.3
-_NEAR, _FAR = 5, 10  # samples to both sides over which unevenness and slopes are measured
+# Samples to both sides over which unevenness and slopes are measured, chosen by hand.
+_NEAR, _FAR = 5, 10
 # Samples along x: robots walk as on a slope from as far away as they can see it, unless there are
 # steps as near.
 _AHEAD = 25
