@@ -58,10 +58,6 @@ from tdgc.tasks.statistics import summarise_high
 from tdgc.tasks.teacher import Skill
 from tdgc.tasks.tiles import check_tiles, left_out
 
-# Share of the imitation over which the teacher hands over to the apprentice. In the last quarter
-# the apprentice alone drives, so that it learns in the states to which its own actions lead. Chosen
-# by hand.
-_LED = 0.75
 #: Where train_low.py writes its policy by default.
 TRAINED_LOW = Path("runs/low/policy")
 
@@ -240,7 +236,7 @@ def build_imitation(
     mdp = dataclasses.replace(
         config.env, curriculum=imitation.curriculum, first_level=0, first_levels=config.env.levels
     )
-    led = _LED * (min(imitation.steps, config.steps) // config.n_envs)
+    led = imitation.led * (min(imitation.steps, config.steps) // config.n_envs)
     shown = dataclasses.replace(config, env=mdp)
     env = make_env(shown, low, True, led, machine)
     model = make_learner(

@@ -44,7 +44,7 @@ from tdgc.show import plots
 from tdgc.sim.locomotion import actor_layout, check_robot
 from tdgc.sim.observation import width
 from tdgc.sim.robot import fitted
-from tdgc.sim.terrain import EDITION
+from tdgc.sim.terrain import EDITION, may_have_trenches
 from tdgc.tasks.low_env import make_task
 from tdgc.tasks.low_observation import low_mirror, low_spaces
 from tdgc.tasks.rules import FALL_HEIGHT, episode_steps
@@ -238,6 +238,12 @@ def main(arguments: list[str] | None = None) -> int:
     on_tiles = config.n_envs - math.floor(config.plane_share * config.n_envs)
     if missing := left_out(config.env.families, on_tiles):
         tqdm.write(f"too few robots for all families: none is on {', '.join(missing)}")
+    fastest, crossing = config.env.commands.vx[1], config.env.crossing
+    if any(map(may_have_trenches, config.env.families)) and fastest < crossing.leap_speed[1]:
+        tqdm.write(
+            f"the command ranges limit leaps over trenches to {fastest:g} m/s, "
+            f"not env.crossing.leap_speed={list(crossing.leap_speed)}"
+        )
     meta = {
         "config": to_dict(config.env),
         "seed": config.seed,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from tdgc.config import (
     PRESETS,
     CommandRanges,
     ConfigError,
+    HighLevelConfig,
     HighTrainConfig,
     LowLevelConfig,
     LowTrainConfig,
@@ -20,6 +22,10 @@ from tdgc.config import (
     to_dict,
     with_overrides,
 )
+from tdgc.sim.locomotion import actor_layout
+from tdgc.sim.observation import width
+from tdgc.tasks.high_observation import high_layout
+from tdgc.tasks.pairing import paired
 
 
 def test_json_round_trip_of_the_defaults() -> None:
@@ -62,6 +68,18 @@ def test_what_was_recorded_must_be_whole() -> None:
     message = r"key 'env\.robot\.urdf' is missing \(default \"urdf/quadr"
     with pytest.raises(ConfigError, match=message):
         recorded(LowTrainConfig, data, "run")
+
+
+def test_a_pair_of_the_first_edition_can_be_used() -> None:
+    """What the files of the pair shipped with it say of its MDPs, from before many settings."""
+    path = Path(__file__).with_name("first_edition.json")
+    first = json.loads(path.read_text(encoding="utf-8"))
+    low = recorded(LowLevelConfig, first["low"]["config"], path)
+    high = paired(recorded(HighLevelConfig, first["high"]["config"], path), low)
+    assert width(actor_layout(low.robot, low.gyro)) == first["low"]["size"] == 74
+    assert width(high_layout(high)) == first["high"]["size"] == 86
+    assert (low.robot.commanded_gait, low.robot.joint_margin, low.physics.hold) == (False, None, 1)
+    assert (high.probes, high.probe_age, high.closing_speed) == ("staggered", False, False)
 
 
 def test_a_run_from_before_the_task_was_configured() -> None:

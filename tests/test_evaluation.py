@@ -690,6 +690,16 @@ def test_results_stay_if_the_low_policy_cannot_be_used(
         assert (tmp_path / name).read_text() == "earlier"
 
 
+@pytest.mark.usefixtures("in_process")
+def test_scripts_say_that_a_low_policy_cannot_leap(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "measure_landing", lambda *_: None)
+    monkeypatch.setattr(evaluation, "HORIZON", 0.04)
+    flags = ["--families", "gap", "--levels", "6", "--episodes", "1", "--workers", "1"]
+    assert evaluate.main([*flags, "--policies", "teacher", "--out", str(tmp_path)]) == 0
+    said = "the low policy falls when it leaps: scripts walk over trenches\n"
+    assert said in capsys.readouterr().out
+
+
 def test_a_results_folder_that_cannot_be_made_is_refused_at_once(tmp_path, monkeypatch, capsys):
     """Before the walks and leaps of a low policy without a high one are tried out."""
     monkeypatch.setattr(evaluate, "find_manner", None)

@@ -1078,19 +1078,36 @@ def test_a_start_from_a_policy_of_other_settings_names_them(
     fresh = tmp_path / "fresh"
     assert train_high.main([*UNTRAINED, "--seed", "7", "--out", str(fresh)]) == 0
     assert weights(fresh) != weights(first)
-    told = [line for line in capsys.readouterr().out.splitlines() if "was trained with" in line]
+    said = capsys.readouterr().out.splitlines()
+    few = "too few robots for all families: none is on tilt, clutter, ditches"
+    assert said.count(few) == 3
+    told = [line for line in said if "was trained with" in line]
     vx = "env.commands.vx=[-1.0, 1.2], not [-1.0, 0.8]"
     assert told == [f"{first / 'policy'} was trained with {vx}"]
 
 
 @pytest.mark.usefixtures("inline_workers")
-def test_a_low_policy_can_start_from_another(tmp_path: Path) -> None:
+def test_a_low_policy_can_start_from_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the schedule has to leave out is said."""
     first, second = tmp_path / "first", tmp_path / "second"
     untrained = [*TINY, "--time-limit", "0"]
     assert train_low.main([*untrained, "--out", str(first)]) == 0
+    assert not re.search("too few|limit leaps", capsys.readouterr().out)
+    untrained += [
+        "--set",
+        'env.families=["stair","gap","tilt"]',
+        "--set",
+        "env.commands.vx=[-1,0.9]",
+    ]
     begin = ["--init", str(first / "policy"), "--seed", "7"]
     assert train_low.main([*untrained, *begin, "--out", str(second)]) == 0
     assert weights(second) == weights(first)
+    said = capsys.readouterr().out.splitlines()
+    assert "too few robots for all families: none is on tilt" in said
+    leaps = "the command ranges limit leaps over trenches to 0.9 m/s"
+    assert f"{leaps}, not env.crossing.leap_speed=[1.0, 1.2]" in said
 
 
 @pytest.mark.usefixtures("inline_workers")

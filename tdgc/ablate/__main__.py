@@ -44,29 +44,35 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     taught, alone = (
         ", ".join(variant.name for variant in variants(alone)) for alone in (False, True)
     )
-    parser.add_argument(
+    trials = parser.add_argument_group("trials")
+    trials.add_argument(
         "--only",
         metavar="NAMES",
         help=f"comma-separated, of {taught}; with --no-teacher of {alone} (all)",
     )
-    parser.add_argument("--seeds", default="42", help="training seeds, e.g. 42,43 (42)")
-    parser.add_argument("--steps", type=int, help="decisions per training (as train_high.py)")
-    parser.add_argument("--levels", default="6-10", help="levels to evaluate (6-10)")
-    parser.add_argument("--episodes", type=int, default=100, help="per family and level (100)")
-    parser.add_argument("--low", type=Path, default=PRETRAINED / "low", help="low policy (shipped)")
-    parser.add_argument(
-        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one per core)"
+    trials.add_argument("--seeds", default="42", help="training seeds, e.g. 42,43 (42)")
+    training = parser.add_argument_group("training")
+    training.add_argument("--steps", type=int, help="decisions per training (as train_high.py)")
+    training.add_argument(
+        "--low", type=Path, default=PRETRAINED / "low", help="low policy (shipped)"
     )
-    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds")
-    parser.add_argument(
+    training.add_argument(
         "--no-teacher", action="store_true", help="train all variants without a teacher"
     )
-    parser.add_argument(
+    training.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments",
         help="setting for all trainings, as in train_high.py; may be repeated",
     )  # fmt: skip
-    parser.add_argument(
+    evaluation = parser.add_argument_group("evaluation")
+    evaluation.add_argument("--levels", default="6-10", help="levels to evaluate (6-10)")
+    evaluation.add_argument("--episodes", type=int, default=100, help="per family and level (100)")
+    run = parser.add_argument_group("run")
+    run.add_argument(
         "--out", type=Path, default=Path("runs/ablation"), help="results folder (runs/ablation)"
+    )
+    run.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds (never)")
+    run.add_argument(
+        "--workers", type=workers_flag, default="auto", metavar="N", help="processes (one per core)"
     )
     return parser.parse_args(arguments)
 

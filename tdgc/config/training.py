@@ -143,6 +143,9 @@ class ImitationConfig:
     # null: found by trials with the low policy before training, see ``tdgc.tasks.manners``. If any
     # of these is set, there are no trials, and the others have their defaults.
     teacher: TeacherConfig | None = field(default=None, metadata={"before": FIRST_TEACHER})
+    # Share of these steps over which the teacher hands over. In the last quarter the student alone
+    # drives, so that it learns in the states to which its own actions lead. Chosen by hand.
+    led: Share = field(default=0.75, metadata={"before": 0.75})
     learning_rate: Positive = 2e-3
     final_learning_rate: Positive = 2e-4  # reached linearly at the last of these steps
     # With two minibatches, 48 updates per rollout, each on half as many decisions as the rollout
