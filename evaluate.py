@@ -242,8 +242,8 @@ class Evaluation:
     def skill(self, low: Policy, config: LowLevelConfig) -> Skill:
         """What the scripts have to know of the low policy.
 
-        They command it as the teacher of the high policy did. Without a high policy that fits, what
-        suits the low policy is tried out.
+        They command it as the high policy's teacher did. Without a high policy that fits, the best
+        speeds are found by trials.
 
         Raises:
             ValueError: the high policy's file cannot be used.

@@ -107,8 +107,8 @@ def with_manner(config: HighTrainConfig, low: Policy, init: Path | None) -> High
     """Add how the teacher commands the low policy, if there is a teacher, and print where the
     command ranges limit it.
 
-    Unless it is set, it is found by trials; a policy ``init`` that training begins from hands on
-    that of its own teacher.
+    Unless the manner is set, it is found by trials or, if training begins from a policy ``init``,
+    taken from that policy's teacher.
 
     Raises:
         PolicyFileError, ConfigError: ``init`` cannot be read.

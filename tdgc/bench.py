@@ -1,4 +1,4 @@
-"""Measure collecting: control steps per second, Bullet's share of the time, memory per robot.
+"""Measure data collection: control steps per second, Bullet's share of the time, memory per robot.
 
     python -m tdgc.bench --out runs/bench
     python -m tdgc.bench --load

@@ -6,8 +6,8 @@ A blind policy trained with random dynamics, pushes and penalties does not walk 
 error differs between gaits but is repeatable: on the nominal robot the mean velocity at a command
 is reproduced to 1 cm/s. So robots walk with commands of all kinds, and networks learn which
 velocity each command leads to. Another network learns which command leads to the velocity that is
-asked for. It becomes part of the copy, and whoever drives it (``tdgc.tasks.executor``, the exported
-graph) asks it first. The policy itself stays the same.
+asked for. That network becomes part of the copy, and whatever drives the policy
+(``tdgc.tasks.executor``, the exported graph) queries it first. The policy itself stays the same.
 """
 
 import argparse
@@ -37,13 +37,13 @@ from tdgc.sim.robot import Array
 from tdgc.tasks.pairing import load_low, mdp_of
 from tdgc.tasks.rules import is_fallen
 
-#: Fewer robots whose walking is measured, 16 with each gait, say nothing about 12 commands.
+#: Minimum number of robots measured, 16 with each gait: fewer say nothing about 12 commands.
 LEAST_ROBOTS = 64
-_LEAST_WALKED = 8  # of them: four are held out to measure the networks' error
+_LEAST_WALKED = 8  # of them without a fall: four are held out to measure the networks' error
 _STREAM = 3  # of random numbers; training and evaluation have others (``tdgc.sim.terrain``)
 _BATCH = 400  # robots that walk at the same time: the default number gives work to twelve cores
-# The mean is over the rest, four cycles or more. Robots speed up within four times 0.3 s, see
-# ``tdgc.tasks.leaps``.
+# s of walking, and s at its start that the mean leaves out; the rest is four cycles or more. Robots
+# speed up within four times 0.3 s, see ``tdgc.tasks.leaps``.
 _WALK_SECONDS, _SETTLE_SECONDS = 3.5, 1.2
 # Factor on the velocity ranges. Commands are corrected up to ``correction.LIMIT``, 1.2, and nothing
 # is known beyond what was measured.
@@ -206,10 +206,10 @@ def calibrate(
 
     Args:
         low: the policy to calibrate.
-        robots: number of them that walk.
-        workers: processes in which the robots walk.
-        seed: of everything random here.
-        tick: called now and then with the share of the work done; what it raises ends the work.
+        robots: number of robots that walk.
+        workers: number of processes in which they walk.
+        seed: seed of all random numbers drawn here.
+        tick: called repeatedly with the share of the work done; raising ends the work.
 
     Returns:
         The correction, and facts about the calibration, whose keys include the units.

@@ -1,4 +1,4 @@
-"""What stops a program: unusable input, failures, interruptions, missing packages; in one line."""
+"""Unusable input, failures, interruptions and missing packages, each reported in one line."""
 
 import functools
 import importlib.util
@@ -32,7 +32,7 @@ FAILURES = (FloatingPointError, OSError, MemoryError, WorkerError)
 
 
 class StoppedError(Exception):
-    """A signal or the time limit came before something was done."""
+    """A signal or the time limit stopped the work before it was complete."""
 
 
 def in_one_line(text: str) -> str:

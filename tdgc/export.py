@@ -243,7 +243,7 @@ def _head(name: str, policy: Policy, graph: LowGraph | HighGraph, rate: float) -
 
 
 def _commands(ranges: CommandRanges) -> list[Table]:
-    """Each command, in order, with its bounds or, if of the embedding, its two values."""
+    """Each command, in order, with its bounds; one of the gait embedding has its two values."""
     bounds = CommandDecoder(ranges)
     rows = zip(COMMANDS.items(), bounds.low.tolist(), bounds.high.tolist(), strict=True)
     return [
@@ -257,7 +257,7 @@ def _commands(ranges: CommandRanges) -> list[Table]:
 def _trained_for(
     config: LowLevelConfig | HighLevelConfig, physics: PhysicsConfig, noises: Collection[str | None]
 ) -> list[Table]:
-    """Ranges of what differed from episode to episode, with those ``noises`` that inputs had."""
+    """Ranges of all that was randomised, with only those ``noises`` that the inputs had."""
     drawn, table = config.randomisation, []
     nominal = {"friction": physics.friction, "motor_strength": 1.0}  # of all others 0
     for name, (unit, meaning) in _DRAWN.items():
@@ -401,7 +401,7 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
     field = TileField.of(make_tile(_CHECKED_ON, 0.5, np.random.default_rng(0)))
     physics = dataclasses.replace(pair.low_config.physics, control_dt=controller.dt)
     world = BulletWorld(1, controller.robot(), physics, field)
-    # The robot is the folder's, what is observed of it are the policies' own configurations.
+    # The robot is the folder's; it is observed as the policies' own configurations specify.
     loco = Locomotion(world, pair.low_config)
     start, goal, executor = field.starts, field.goals, Executor(loco, pair.low)
     differences: list[Array] = []
@@ -436,8 +436,8 @@ def check(folder: Path, form: str, low: str | Path, high: str | Path) -> Check:
 def _act(
     pair: Pair, controller: Controller, driver: HierarchyDriver, executor: Executor
 ) -> list[Array]:
-    """Carry out a step that controller and driver have decided on; how far policies and graphs
-    differ in it."""
+    """Carry out a step that controller and driver have decided on; return the differences between
+    graphs and policies in it."""
     loco, limit = executor.loco, pair.low_config.robot.action_limit
     world = loco.world
     decoder = CommandDecoder(driver.bounds, pair.high_config.action_limit, pair.high_config.gaits)

@@ -517,7 +517,7 @@ def test_bad_weights(saved):
         weight = tensors["critic.0.weight"].clone()
         weight[2, 3] = bad
         reweigh(saved, safetensors.torch.save({**tensors, "critic.0.weight": weight}))
-        refused(saved, "'critic.0.weight' holds a number not finite")
+        refused(saved, "'critic.0.weight' holds a non-finite number")
 
 
 class Bomb:

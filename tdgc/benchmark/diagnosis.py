@@ -374,8 +374,8 @@ def count_failures(
 ) -> list[dict[str, Any]]:
     """Count failures by policy, condition, family and level, and find where most can be gained.
 
-    That is the family and layer with the most failures, which are given in points: per cent of all
-    episodes of the policy and condition.
+    Most can be gained in the family and layer with the most failures. Their number is given in
+    points: per cent of all episodes of the policy and condition.
 
     Args:
         diagnoses: rows of diagnosis.csv.

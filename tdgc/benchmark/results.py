@@ -278,11 +278,11 @@ def salvage(
     cells: Sequence[Cell],
     training: Training | None = None,
 ) -> Iterator[tqdm]:
-    """Progress bar for running episodes that keeps what is ``complete`` whatever stops them;
-    SIGTERM does so as Ctrl-C does, with a KeyboardInterrupt.
+    """Progress bar for running episodes, which keeps the ``complete`` ones whatever stops the run;
+    SIGTERM stops it like Ctrl-C, with a KeyboardInterrupt.
 
-    It then writes and prints the table of those episodes, adds a note with their number to the
-    exception, and re-raises it.
+    If stopped, it writes and prints the table of those episodes, adds a note with their number to
+    the exception, and re-raises it.
 
     Args:
         folder, training: as for ``write_results``.

@@ -212,7 +212,7 @@ class TunedDriver(HierarchyDriver):
         self._bounds = command_bounds(self.bounds).T
         self._gaits = np.array(sorted(GAITS.index(name) for name in tuning.decoder.gaits))
         self._safety = tuning.safety
-        most = tuning.decoder.frequency.high  # a gait still begins faster than the policy's bound
+        most = tuning.decoder.frequency.high  # the policy's own bound does not cap a gait's start
         self._frequency_limit = np.inf if most is None else most
 
     def begin(self, loco: Locomotion, goal: Array, family: str, noise: Noise | None = None) -> None:

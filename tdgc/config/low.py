@@ -81,15 +81,15 @@ class CommandDrawConfig:
     # Of free commands. Most crossings are in trot.
     gaits: GaitShares = (0.2, 0.2, 0.3, 0.3)
     standing: Share = 0.1  # with zero velocity: the robot steps on the spot at every goal
-    # Of free commands that leap: pronk with a stride as long as the trunk, so that front and rear
-    # feet land on the same lines and a trench fits between two of these. Among uniform draws such
-    # commands are too rare: commanded 0.86 m/s at 2 Hz, the robot reached 0.5 m/s.
+    # Share of free commands that leap: pronk with a stride as long as the trunk, so that front and
+    # rear feet land on the same lines and a trench fits between two of these. Among uniform draws
+    # such commands are too rare: commanded 0.86 m/s at 2 Hz, the robot reached 0.5 m/s.
     leaps: Share = 0.05
     leap_vx: SharesRange = (0.85, 1.0)  # shares of the range: 0.9-1.2 m/s
     leap_frequency: SharesRange = (0.0, 0.375)  # shares of the range: 2-2.75 Hz
-    # Of free commands that repeat one at which a robot fell. Most commands cause no fall, so those
-    # still to be learned are rare in uniform draws: a third of the robots that walked backward in a
-    # slow trot fell within six seconds.
+    # Share of free commands that repeat one at which a robot fell. Most commands cause no fall, so
+    # those still to be learned are rare in uniform draws: a third of the robots that walked
+    # backward in a slow trot fell within six seconds.
     retries: Share = field(default=0.15, metadata={"before": 0.0})
     growth: Share = 0.05  # of the full ranges, added when a gait was tracked well
     # Control steps (4 s) after which a gait with a quarter of the robots is judged.
@@ -121,10 +121,11 @@ class CrossingConfig:
     leap_speed: Range = (1.0, 1.2)  # m/s, about ``tdgc.tasks.leaps.SPEED``
     facing: Share = 0.8  # face their direction of travel; the others face any direction
     heading_gain: float = 1.0  # 1/s, commanded yaw rate per rad of heading error
-    # Crossings narrow the command ranges. m added to the lowest swing height, at difficulty 0 and
-    # 1: with feet below 9 cm a third of the robots crossed level 0 of Gap, above 16 cm all of them.
+    # Crossings narrow the command ranges. m by which they raise the lowest swing height, at
+    # difficulty 0 and 1: with feet below 9 cm a third of the robots crossed level 0 of Gap, above
+    # 16 cm all of them.
     clearance: tuple[float, float] = (0.05, 0.15)
-    bend: Share = 0.3  # of the pitch and roll ranges, which is left at difficulty 1
+    bend: Share = 0.3  # share of the pitch and roll ranges that is left at difficulty 1
     leap_decimation: Count = 5  # control steps between decisions on a leap, as in the high policy
     landing_rate: Share = 0.002  # weight of a landing in the running mean: the last 500 count
     shallowest_trench: Positive = 0.05  # m, depth on level 0, see ``tdgc.tasks.tiles.shallow``

@@ -125,8 +125,8 @@ class CommandRanges:
 class RandomisationConfig:
     """Domain randomisation, drawn at each reset unless a comment states otherwise.
 
-    ``scale`` multiplies the width of every range but ``push_interval`` about its nominal value; 0
-    switches all of them off.
+    ``scale`` scales every range but ``push_interval`` about its nominal value; 0 switches off all
+    randomisation.
     """
 
     scale: NotNegative = 1.0

@@ -42,7 +42,7 @@ class CalibrationConfig:
     #: Settings of earlier calibrations, which runs may have recorded.
     RETIRED: ClassVar[tuple[str, ...]] = ("turns",)
 
-    robots: Whole = 4800  # whose walking is measured; 0: none
+    robots: Whole = 4800  # robots whose walking is measured; 0: no calibration
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class LowTrainConfig:
     n_envs: Count = 120
     workers: Count = 2
     steps: Count = 36_000_000  # control steps of reinforcement learning, over all robots
-    # Of the robots, on the plane, where a step costs less than half as much as on a tile; the
-    # others are on tiles.
+    # Share of the robots that train on the plane, where a step costs less than half as much as on
+    # a tile; the others train on tiles.
     plane_share: Share = 0.6
     log_steps: Count = 100_000
-    checkpoint_seconds: NotNegative = 30.0  # with the update under way, less than a minute is lost
+    checkpoint_seconds: NotNegative = 30.0  # a crash loses this and one update: less than a minute
     env: LowLevelConfig = field(default_factory=LowLevelConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     calibration: CalibrationConfig = field(
@@ -78,8 +78,8 @@ class RecurrentPPOConfig:
     # that imitation leaves.
     learning_rate: Positive = 1.5e-4
     final_learning_rate: Positive = 5e-5  # reached linearly at the last step
-    # KL divergence of an update, beyond twice which the actor's learning rate is lowered for the
-    # next, see ``tdgc.learn.recurrent.adapted_share``. null: no such limit.
+    # KL divergence of an update; after an update beyond twice this, the actor's learning rate is
+    # lowered, see ``tdgc.learn.recurrent.adapted_share``. null: no such limit.
     desired_kl: Positive | None = field(default=None, metadata={"before": None})
     n_steps: Count = 24  # decisions per robot between updates
     minibatches: Count = 4
@@ -178,7 +178,7 @@ class HighTrainConfig:
     workers: Count = 2
     steps: Count = 2_100_000  # decisions over all robots: 80 minutes to 3 hours on two cores
     log_steps: Count = 24_000
-    checkpoint_seconds: NotNegative = 30.0  # with the update under way, less than a minute is lost
+    checkpoint_seconds: NotNegative = 30.0  # a crash loses this and one update: less than a minute
     start_speed: float = 0.5  # m/s: the untrained policy walks straight ahead in the default gait
     # m, swing height of the untrained policy; 0.08 is the default of Walk These Ways.
     start_swing: NotNegative = field(default=0.08, metadata={"before": 0.08})
@@ -237,14 +237,15 @@ NO_TEACHER: tuple[str, ...] = (
     "ppo.desired_kl=0.015",
     "ppo.memory_exchange=0",
     "env.unknown_share=0",
-    # As many robots on each family: by default three in eight are among trenches, where they learn
-    # least.
+    # The same number of robots on each family: by default three in eight are among trenches, where
+    # they learn least.
     'env.families=["rough","pillar","stair","gap","tilt"]',
-    # With feet at 0.08 m it reached 67 % of the goals on Stair, with feet as high as gp's, 98.5 %.
+    # With feet at 0.08 m the policy reached 67 % of the goals on Stair; with feet as high as those
+    # of the baseline, ``gp``, 98.5 %.
     "start_swing=0.19",
-    # Standing at the start must not pay. If distances are shares of the tile's 8 m, standing is
-    # worth more than walking on from an expected 0.086 falls per second, and the untrained policy
-    # has 0.08; if they are shares of the distance between start and goal, from 0.24.
+    # Standing at the start must not pay. With distances as shares of the tile's 8 m, standing is
+    # worth more than walking once 0.086 falls per second are to be expected, and the untrained
+    # policy has 0.08; with shares of the distance from start to goal, the threshold is 0.24.
     "env.rewards.map_radius=6.5",
     # A trench 60 cm deep ends every attempt to cross it.
     "env.shallowest_trench=0.05",

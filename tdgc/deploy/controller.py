@@ -66,11 +66,11 @@ class Graph:
         """Check that the readings which the graph takes are there, of the right shape and finite.
 
         Args:
-            readings: by name.
-            only: name of the one to check; None for all.
+            readings: values by input name.
+            only: name of the reading to check; None for all.
 
         Raises:
-            ExportError: one is not; ``memory`` would be wrong from then on.
+            ExportError: a reading fails; with it, ``memory`` would be wrong from then on.
         """
         for signal in self.table["inputs"]:
             name, shape = signal["name"], tuple(signal["shape"])
@@ -240,7 +240,7 @@ class Controller:
         low, high = self.low.table, self.high.table
         for misfit in pair_misfits(low, high):
             raise ExportError(
-                f"low and high in '{folder}' are of two exports: {misfit}; export the pair again"
+                f"low and high in '{folder}' come from two exports: {misfit}; export the pair again"
             )
         self._task, self._probes = high["task"], high["probes"]
         self._stand = np.array(self._task["stand"]["value"])
@@ -299,7 +299,7 @@ class Controller:
 
     def over(self, step: int, reached_at: int | None) -> bool:
         """Whether ``high`` has stopped by ``step``: at the horizon, or ``keep_deciding`` seconds
-        after step ``reached_at``, in which the goal was reached, if it was."""
+        after the goal was reached in step ``reached_at``; None if it has not been reached."""
         keep = round(self._task["after_goal"]["keep_deciding"]["value"] / self.dt)
         held = reached_at is not None and step - reached_at >= keep
         return step >= self.horizon or held

@@ -61,7 +61,7 @@ def read_interface(folder: Path, name: str) -> Table:
 
 @functools.cache
 def _validator(name: str) -> Any:
-    """Validator of the graph ``name``'s interface file; NaN and Infinity are no numbers to it."""
+    """Validator of the graph ``name``'s interface file, which rejects NaN and Infinity."""
     from jsonschema import Draft202012Validator, validators
 
     known, largest = Draft202012Validator.TYPE_CHECKER, sys.float_info.max
@@ -103,7 +103,7 @@ def _misfits(table: Table) -> Iterator[str]:
 
 
 def pair_misfits(low: Table, high: Table) -> Iterator[str]:
-    """Describe what in the interfaces of two graphs shows that they are not of one export."""
+    """Describe each mismatch that shows that two interfaces come from different exports."""
     if low["robot"]["standing_height"] != high["probes"]["plane_below_trunk"]:
         yield "their standing heights differ"
     every = high["order"][0]["every"]

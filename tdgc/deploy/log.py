@@ -48,14 +48,14 @@ ENDS = ("reached", *UNSEEN, "timeout")
 _SAME = 5e-3  # in the value's own unit: logs with four decimals differ by up to 3e-3, in leaps
 # Share of a step: at 50 Hz the millisecond to which a program may round its time stamps.
 _PUNCTUAL = 0.05
-# Off the length of gravity: training's errors, 0.02 in each entry, reach 0.035; those of Walk These
-# Ways, 0.05, reach 0.087.
+# Allowed error of gravity's length: training's errors, 0.02 in each entry, reach 0.035; those of
+# Walk These Ways, 0.05, reach 0.087.
 _LENGTH = 0.1
-# rad beyond a joint's limits: simulated joints and the errors of their sensors reach 0.04; the calf
-# of a standing robot is 2.4 beyond with the wrong sign, and 83 in degrees.
+# rad allowed beyond a joint's limits: simulated joints with sensor errors reach 0.04; the calf of a
+# standing robot is 2.4 beyond them with the wrong sign, and 83 in degrees.
 _BEYOND = 1.0
-# Times the speed limit of the joints, chosen by hand: impacts may exceed it somewhat; in degrees
-# speeds are 57 times as large.
+# Allowed multiple of the joints' speed limit, chosen by hand: impacts may exceed it somewhat; in
+# degrees, speeds are 57 times as large.
 _OVER = 5.0
 _TURN = 35.0  # rad/s: the usual range of gyros, 2000 degrees/s
 
@@ -209,7 +209,7 @@ def _read_csv(path: Path, known: Collection[str]) -> dict[str, NDArray[Any]]:
 def _mistimed(time: Array, dt: float) -> str | None:
     """Describe what is wrong with the time stamps of rows ``dt`` s apart; None if nothing is.
 
-    A row that is late by less than a step is not: the program was slow there, but left no row out.
+    A row that is late by less than a step is accepted: the program was slow but left no row out.
     """
     if len(time) < 2 or not np.isfinite(time).all():
         return "needs two rows at least, each with its time"
@@ -385,8 +385,8 @@ def trace(log: Log, controller: Controller, told: str | None = None) -> Trace:
         told: how the episode ended, if the log does not show it.
 
     Raises:
-        LogError: see ``outcome``; or the robot fell, collided or left its tile when no decision was
-            carried out any more.
+        LogError: see ``outcome``; or the robot fell, collided or left its tile after its last
+            decision had been carried out.
     """
     seen, begin = log.values, log.decisions
     end = np.minimum(begin + controller.decimation, len(log.time) - 1)

@@ -91,14 +91,14 @@ class Link(Protocol):
         """Send a request, see ``Worker.answer``. A dead worker is only noticed by ``receive``."""
 
     def receive(self, timeout: float) -> Any:
-        """Its answer, within ``timeout`` s. The first answer, without a request, is its state.
+        """The worker's next answer, within ``timeout`` s; the first one, unrequested, is its state.
 
         Raises:
-            WorkerError: it died, hung or raised; it accepts no further requests.
+            WorkerError: the worker died, hung or raised; it accepts no further requests.
         """
 
     def end(self, timeout: float) -> None:
-        """End it, by force if it is still running after ``timeout`` s."""
+        """End the worker, by force if it is still running after ``timeout`` s."""
 
 
 # ---------------------------------------------------------------------------- the worker
@@ -280,8 +280,8 @@ def signals_left_to_parent() -> Iterator[None]:
     """Block, in processes started in this context, the signals that a terminal or a batch system
     sends to all processes.
 
-    They inherit it, so it holds while they still import their modules. Signals to this process are
-    handled at the end of the context.
+    The processes inherit the block, so it already holds while they import their modules. Signals to
+    this process are handled at the end of the context.
     """
     resource_tracker.ensure_running()  # with the first process it would unblock the signals
     blocked = signal.SIGINT, signal.SIGTERM
@@ -334,7 +334,7 @@ def keep_memory() -> None:
 def _without_script(needed: Any) -> Iterator[None]:
     """Keep processes started in this context from importing the running script.
 
-    They would import everything it imports. It is left in place if ``needed`` is defined in it.
+    They would import everything it imports. The script is left in place if it defines ``needed``.
     """
     script = sys.modules["__main__"]
     if b"__main__" not in pickle.dumps(needed):

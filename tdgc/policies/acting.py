@@ -112,7 +112,7 @@ class Policy:
         self._rng = np.random.default_rng(seed)
 
     def correct(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What to tell a low policy for it to do what ``commands`` (n, 15) ask for, (n, 15).
+        """Commands to give a low policy so that it does what ``commands`` (n, 15) ask for, (n, 15).
 
         Only the velocities differ, and those only for a calibrated policy.
         """

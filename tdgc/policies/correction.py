@@ -1,4 +1,4 @@
-"""A calibrated low policy's correction: what to tell it so that it moves as it is asked to."""
+"""A calibrated low policy's correction: the commands to give it so that it moves as asked."""
 
 from collections.abc import Mapping, Sequence
 

@@ -434,7 +434,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, dict[str, th.Tensor]]:
             )
         array = np.frombuffer(entry["data"], "<f4").astype(np.float32).reshape(shape)
         if not np.isfinite(array).all():
-            raise PolicyFileError(f"{weights_path}: tensor '{name}' holds a number not finite")
+            raise PolicyFileError(f"{weights_path}: tensor '{name}' holds a non-finite number")
         tensors[name] = th.from_numpy(array)
     return header, tensors
 

@@ -37,9 +37,9 @@ _PARKED = 50.0  # m, lift that clears all terrain, which stays within HEIGHT_RAN
 _SKY = (226, 234, 243)  # light enough for print, and the robot's white shell stands out
 # m, chosen by hand: a calf this close to the ground is in contact, even if it does not press.
 _TOUCHES = 0.0005
-#: rad/s^2: a leg in contact is not held against what rotors give back if that is less than this
-#: times J. Then feet that meet a riser at less than 0.4 m/s bounce back; half of it would halve
-#: that speed, but twice as many legs would be looked up.
+#: rad/s^2: a leg in contact is held against what rotors give back only if that exceeds this times
+#: J. So feet that meet a riser at less than 0.4 m/s bounce back; half of it would halve that speed,
+#: but twice as many legs would be looked up.
 _FELT = 500.0
 # m beyond the foot's radius, chosen by hand: nearer calf contacts are the foot's.
 _FOOT_REACH = 0.03

@@ -172,7 +172,7 @@ def stair(section: Section, step_height: float, rng: np.random.Generator) -> Rel
 def gap(section: Section, width: float, rng: np.random.Generator) -> Relief:
     """Trenches across the whole tile, at random with centres at least ``TRENCH_SPACING`` apart.
 
-    Each lowers the floor or the ceiling of w / cell samples, at random so that the mean width is w.
+    Each lowers floor(w / cell) or ceil(w / cell) samples, at random so that the mean width is w.
     Since the walls slope over one cell on either side, a trench of n samples is n - 1, n and n + 1
     cells wide at its bottom, at half its depth and at its top.
     """

@@ -144,8 +144,8 @@ class Crossings:
         highest = np.clip(SWING_HEIGHT, low, self._high[swing])
         values[leaps, swing] = rng.uniform(low, highest, int(leaps.sum()))
         for j, usual in (
-            (INDEX["duration"], DURATION),  # that landings are planned for
-            *zip(STRIDE_COMMANDS, (SPEED / STRIDE, STRIDE), strict=True),  # until one is planned
+            (INDEX["duration"], DURATION),  # the duty factor that landings are planned for
+            *zip(STRIDE_COMMANDS, (SPEED / STRIDE, STRIDE), strict=True),  # until a plan is made
         ):
             values[leaps, j] = np.clip(usual, self._low[j], self._high[j])
         e.leaping[index] = leaps

@@ -17,7 +17,7 @@ class Acts(Protocol):
         """Observations (n, d) -> actions (n, 12), and a second value that is ignored here."""
 
     def correct(self, commands: Array) -> Array:
-        """Commands (n, 15) -> what to tell the policy for it to carry them out, (n, 15)."""
+        """Commands (n, 15) -> those to give the policy so that it carries them out, (n, 15)."""
 
 
 class Carries(Protocol):

@@ -60,8 +60,8 @@ _DECIDED, _CHANGE_PRICE = 0.4, 0.5
 _PRONK = gait_embedding(GAITS.index("pronk"))
 #: Commands that decide on the next stride: step frequency and stance length.
 STRIDE_COMMANDS = [INDEX["frequency"], INDEX["stance_length"]]
-# How many are tried at each decision, evenly over the command ranges. Neighbours move a landing by
-# about a centimetre, the grid spacing of a plan.
+# Numbers of values tried at each decision, evenly spaced over the command ranges. Neighbouring
+# values move a landing by about a centimetre, the grid spacing of a plan.
 FREQUENCIES, LENGTHS = 25, 11
 # How leaping robots speed up, from two low policies: 0.8, 1.1 and 1.2 m/s at the first landings
 # from rest, and 1.14 m/s in the long run when 1.2 is commanded. Without this model, landings at a
@@ -356,7 +356,8 @@ def steer_leap(
 _ROBOTS = 16  # number of robots in a measurement, which repeats to a few millimetres
 # s, duration of the measurement, and of speeding up within it: five times ``_RISE``.
 _SECONDS, _SETTLE = 6.0, 1.5
-# Least share of robots still up after the measurement if the policy can leap: most.
+# Share of robots that must still be up after the measurement if the policy is to count as able to
+# leap.
 _STANDING = 0.5
 _RATE = 0.02  # weight of a landing: after 180 of them 3 % of the initial estimate is left
 

@@ -357,8 +357,8 @@ def make_task(
     *,
     first: int = 0,
 ) -> Task:
-    """Make a worker's task: a ``share`` of the run's robots in the first MDP, the rest, at least
-    one in the run, in the second. ``first`` robots of the run are in the workers before it."""
+    """Make a worker's task: a ``share`` of the run's robots act in the first MDP, the rest (at
+    least one in the run) in the second; ``first`` of the run's robots are in earlier workers."""
     before = math.floor(share * first)
     here = math.floor(share * (first + robots)) - before
     numbers, firsts = (here, robots - here), (before, first - before)

@@ -103,9 +103,9 @@ def raibert_targets(
 ) -> Array:
     """Footholds of Raibert's rule in the heading frame: (M, 15), (M, 4) -> (M, 4, 2) m.
 
-    They are the corners of the commanded stance rectangle, whose middle is ``centre`` m ahead of
-    the trunk's, as that of the hips is, shifted by ``robot.foot_travel``. Its length and width
-    differ from ``stance`` (2,) m, those of the robot at the default commands, as the commands do
+    They are the corners of the commanded stance rectangle, shifted by ``robot.foot_travel``. Its
+    middle is ``centre`` m ahead of the trunk's, like that of the hips. Its length and width are
+    those of the robot at the default commands, ``stance`` (2,) m, plus the commands' differences
     from their defaults.
     """
     rectangle = command[:, _STANCE] + (np.array(stance) - default_command()[_STANCE])

@@ -1,6 +1,6 @@
 """Trials of how fast the teacher should walk, step and leap with a low policy.
 
-What suits depends on the low policy. With the shipped one nothing is better than the usual speeds.
+The best speeds depend on the low policy. With the shipped one, none are better than the usual ones.
 At these the Unitree A1's falls on the higher stairs and between trenches; it needs faster walks
 with faster steps, and slower leaps (docs/experiments.md).
 """

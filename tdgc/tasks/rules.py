@@ -22,7 +22,7 @@ def episode_steps(seconds: float, step: float) -> int:
     """Number of steps of ``step`` s in an episode of ``seconds``.
 
     Raises:
-        ConfigError: not a single one.
+        ConfigError: the episode would not last a single step.
     """
     if round(seconds / step) < 1:
         raise ConfigError(f"'env.episode_seconds' must last a step of {step:g} s, not {seconds:g}")
@@ -49,7 +49,7 @@ def outcome(
     if world.field is not None:
         ended[~world.field.on_tile(np.arange(len(x)), x, y)] = LEFT_TILE
     ended[world.state.trunk_force > TRUNK_FORCE] = COLLIDED
-    # So written that a robot whose simulation has blown up, at NaN, has fallen as well.
+    # Written so that a robot whose simulation has blown up (height NaN) counts as fallen, too.
     ended[~(world.trunk_height() >= FALL_HEIGHT)] = FELL
     return ended
 

@@ -22,8 +22,8 @@ STEP = 0.2
 # m, lowest step that is avoided where the way around it is not much longer. On a map of boxes of 5
 # to 30 cm the teacher reached 5 of 30 goals when it climbed all steps up to ``STEP``.
 _LOW_STEP = 0.1
-# Cost per metre within so many m of such a step, half a stance and a little; 1 in the open. With
-# these the teacher reached all of the same 30 goals.
+# Cost per metre beside such a step (1 in the open), and m that count as beside it: half a stance
+# and a little. With these the teacher reached all of the same 30 goals.
 _STEP_PRICE, _BESIDE = 6.0, 0.25
 #: m, widest trench to leap over, from lip to lip: strides are up to ``leaps.LONGEST``, 0.48 m.
 WIDEST = 0.45
@@ -34,14 +34,14 @@ _CORRIDOR = Y_SPREAD + 0.6
 _COARSE = 2
 #: m, spacing of travel costs: every second sample.
 GRID = _COARSE * CELL
-# Tangent of the least slope that counts, chosen by hand, and m: the ground within 0.5 m may deviate
-# from its mean by so much times the slope. On Tilt it deviates by up to 0.2 m times the slope, on
-# Rough by at least 0.8 m.
+# Tangent of the least slope that counts, chosen by hand; and m: times the slope, the most by which
+# the ground within 0.5 m may deviate from its mean. On Tilt it deviates by up to 0.2 m times the
+# slope, on Rough by at least 0.8 m.
 _LEAST_SLOPE, _UNEVEN = 0.04, 0.3
 # Samples to both sides over which unevenness and slopes are measured, chosen by hand.
 _NEAR, _FAR = 5, 10
-# Samples along x: robots walk as on a slope from as far away as they can see it, unless there are
-# steps as near.
+# Samples along x: robots use the style for slopes from as far away as they can see one, unless
+# there are steps within that distance.
 _AHEAD = 25
 _SLOPING_ON = {"mode": "reflect", "reflect_type": "odd"}  # ground beyond the tile keeps its slope
 
@@ -190,7 +190,7 @@ def _mean(grid: Array, axis: int, n: int) -> Array:
 
 
 def _close(grid: Array, n: int) -> Array:
-    """A grid with dips along x filled that are narrower than ``n`` samples, an odd number, from
-    lip to lip."""
+    """The grid with its dips along x filled where they are narrower, from lip to lip, than ``n``
+    samples; ``n`` is odd."""
     wide = _windows(grid, 0, n // 2, mode="edge").max(axis=-1)
     return _windows(wide, 0, n // 2, mode="edge").min(axis=-1)

@@ -47,7 +47,7 @@ class Style:
         swing_height, stance_width, body_height: m.
         duration: duty factor.
         pitch: rad, nose down positive.
-        uphill: m/s; times the sine of a lateral slope, the velocity up it, against sliding down.
+        uphill: m/s; times the sine of a lateral slope, the uphill velocity that counters sliding.
     """
 
     speed: float
@@ -154,9 +154,9 @@ class Teacher:
 
     Args:
         field: M tiles.
-        ranges: of the commands that it may give.
-        robot: whose first steps in a gait may be faster than commanded.
-        skill: of the low policy.
+        ranges: ranges of the commands that it may give.
+        robot: configuration of the robots; a gait may begin faster than commanded.
+        skill: what it has to know of the low policy.
 
     Attributes:
         speed: (M,) m/s forward, an estimate from how leaps speed up and from the speeds seen.
