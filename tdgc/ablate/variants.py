@@ -87,7 +87,7 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("gp", "the scripted baseline", policy="gp"),
     Variant("gp-fixed-pose", "the same, nominal pose", low="fixed-pose", policy="gp"),
     Variant("gp-uncalibrated", "the same, not calibrated", low="uncalibrated", policy="gp"),
-    Variant("cues", "a script that sees what the policy sees", policy="cues"),
+    Variant("cues", "a script that reads the same cues", policy="cues"),
     Variant("teacher", "the scripted teacher, which knows the tile", policy="teacher"),
 )
 #: Rows for trainings with a teacher, next to each other: without one, robots are on the benchmark's
