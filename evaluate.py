@@ -290,11 +290,6 @@ class Evaluation:
                     drivers[TUNED] = TunedDriver(*pair, config, self.tuning)
         return drivers
 
-    def make_room(self) -> None:
-        """Delete an earlier table in the results folder, and make the folders of this one."""
-        folders = {"films": self.filmed > 0, "traces": self.traced is not None}
-        make_room(self.out, report.DERIVED, folders)
-
 
 @dataclass(frozen=True)
 class Ran:
@@ -344,7 +339,7 @@ def run_one(
 def run_table(
     evaluation: Evaluation, low: Policy, drivers: Mapping[str, Driver], trained_on: Training
 ) -> list[str]:
-    """Run all cells and write all results.
+    """Run all cells and write all results, in place of those of an earlier table.
 
     Args:
         evaluation: what to run.
@@ -359,6 +354,8 @@ def run_table(
         BaseException: what stopped it; the table of the complete cells is written first.
     """
     e, out = evaluation, evaluation.out
+    folders = {"films": e.filmed > 0, "traces": e.traced is not None}
+    make_room(out, report.DERIVED, folders)
     cells = plan(list(drivers), e.conditions, e.families, e.levels, e.episodes)
     work = functools.partial(
         run_one, low=low, drivers=drivers, seed=e.seed, filmed=e.filmed, traced=e.traced
@@ -475,7 +472,6 @@ def main(arguments: list[str] | None = None) -> int:
     if evaluation.mode == "tracking":
         run_tracking(evaluation, low, trained_on)
     elif evaluation.mode == "table":
-        evaluation.make_room()
         problems = run_table(evaluation, low, drivers, trained_on)
     else:
         run_window(evaluation, low, drivers)

@@ -57,13 +57,13 @@ def training(main: Callable[[list[str]], int], flags: Sequence[str]) -> str:
         return hashlib.sha256((Path(folder) / "policy.safetensors").read_bytes()).hexdigest()
 
 
-def graphs(steps: int = 100, form: str = "onnx") -> str:
-    """Joint targets of the exported pair, in ONNX Runtime or TorchScript, for random readings."""
+def graphs(steps: int = 100) -> str:
+    """Joint targets of the exported pair, in ONNX Runtime, for random readings."""
     rng, digest = np.random.default_rng(0), hashlib.sha256()
     with tempfile.TemporaryDirectory() as folder:
         pair = export.load_pair(PRETRAINED / "low", PRETRAINED / "high")
-        export.write(pair, Path(folder), [form])
-        controller = Controller(Path(folder), form)
+        export.write(pair, Path(folder), ["onnx"])
+        controller = Controller(Path(folder))
         sizes = {
             signal["name"]: signal["shape"]
             for graph in (controller.low, controller.high)

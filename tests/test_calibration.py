@@ -151,11 +151,14 @@ def short_walk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("short_walk")
-def test_robots_are_measured_beyond_the_ranges(low: Policy) -> None:
+def test_robots_are_measured_in_all_gaits_beyond_the_ranges(low: Policy) -> None:
     given, reached = measure(low, 24, seed=5)
     assert len(given) == len(reached) <= 24 and reached.shape[1] == 3
     assert (np.abs(given[:, :3] - MIDDLE) <= 1.4 * HALF + 1e-9).all()
     assert (np.abs(given[:, :3] - MIDDLE) > HALF).any()
+    rows = {tuple(row) for row in given[:, 12:]}
+    assert rows <= {tuple(gait_embedding(g)) for g in range(len(GAITS))}
+    assert len(rows) >= 2
     twice = measure(low, 24, seed=5)
     assert (twice[0] == given).all() and (twice[1] == reached).all()
 

@@ -145,7 +145,12 @@ def test_other_interfaces_are_refused(
         ("low", "inputs 7 previous", "next_phase", "'clock' has the size 1, its previous 'next_p"),
         ("low", "inputs 8 start 0", None, "'last_commands' has the size 15, its start has 14"),
         ("low", "inputs 6 source", "high.orders", "two exports: 'commands' has the shape [15], "),
-        ("high", "commands 0 high", 1.3, "two exports: high's bounds of vx exceed low's; expo"),
+        (
+            "high",
+            "commands 0 high",
+            1.3,
+            "come from two exports: high's bounds of vx exceed low's; expo",
+        ),
         ("high", "probes plane_below_trunk value", 0.28, "two exports: their standing heights d"),
         ("high", "rate value", 20, "low runs at 50 Hz, which is not 5 times high's 20 Hz"),
         ("high", "task family otherwise", "sand", "task.family.otherwise is 'sand', no family"),

@@ -327,6 +327,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev/shm")
 @pytest.mark.parametrize("killed", [True, False])
 def test_nothing_outlives_the_parent(killed: bool, tmp_path: Path) -> None:
     """An idle worker and one that hangs both end, whether the parent is killed or just ends.
@@ -343,6 +344,7 @@ def test_nothing_outlives_the_parent(killed: bool, tmp_path: Path) -> None:
         parent.kill()
     rest, _ = parent.communicate(timeout=300.0)
     assert rest == "" and parent.returncode == (-signal.SIGKILL if killed else 0)
+    assert not list(Path("/dev/shm").glob(f"*-{parent.pid}-*"))
 
 
 def test_a_fault_in_one_line() -> None:

@@ -17,4 +17,4 @@ def test_what_is_computed_again_has_the_same_hash(monkeypatch: pytest.MonkeyPatc
     nudged = Policy(shipped.header, {n: 1.0001 * t for n, t in shipped.tensors.items()})
     monkeypatch.setattr("hashes.load_low", lambda path: (nudged, config))
     assert episodes(["tilt"], 1) != before
-    assert graphs(12, "torchscript") == graphs(12, "torchscript")
+    assert graphs(steps=12) == graphs(steps=12)

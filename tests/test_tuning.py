@@ -278,9 +278,15 @@ def test_anything_else_is_a_tuning_or_one_line(tmp_path_factory, data, texts):
     keys = ["decoder.vx.high=", "decision_rate=", "decoder.gaits=", ""]
     assignments = [key + text for key, text in zip(keys, texts, strict=False)]
     try:
-        check(load(path, assignments), HIGH, LOW)
+        found = load(path, assignments)
+        check(found, HIGH, LOW)
     except ConfigError as error:
         assert len(str(error).splitlines()) == 1
+    else:
+        ranges = tuned_ranges(found, HIGH, LOW)
+        for name in CONTINUOUS:
+            (low, high), (bottom, top) = getattr(LOW.commands, name), getattr(ranges, name)
+            assert low <= bottom <= top <= high
 
 
 @examples
